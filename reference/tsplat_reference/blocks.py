@@ -1,0 +1,245 @@
+"""Blending and its backward on a CPU: cache-sized blocks of tiles x pixels x splats, matrix products, in-place operations.
+
+The splats of a tile are taken in chunks. Blocks of tiles that still have splats and light left go through one chunk together: the
+polynomial of `footprint` gives log alpha as a matrix product, a cumulative product gives the transmittance, and colours, their
+gradients and the moments for the geometry are matrix products again. Between chunks a pixel keeps its light, the transmittance in
+front of the next splat, and in the backward the rest: what is still to come, times the upstream gradient. Finished tiles drop out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from tsplat_reference import footprint
+from tsplat_reference.binning import tile_counts
+from tsplat_reference.blending import to_image, to_tiles
+from tsplat_reference.constants import ALPHA_MIN, TRANSMITTANCE_MIN
+from tsplat_reference.parallel import workers
+
+CHUNK = 64
+"""Splats of a tile per chunk. Finished pixels end with it, so more would waste work; fewer would pay the calls more often."""
+BLOCK = 1 << 18
+"""Pairs in a block: five buffers of this size, 5 MB in float32, are the working set of a thread. Smaller ones fit closer caches, but then
+the calls cost more than that gains (measured from 2^15 to 2^19)."""
+GROUP = 1 << 15
+"""Hits of a group of blocks, whose small operations (gathering, coefficients, scattering) are done together, by one thread: about 60
+numbers per hit, 8 MB in float32. With more than 8 channels a group has fewer hits."""
+TINY = 1e-20
+"""Below any transmittance that counts; keeps the divisions by it finite where nothing counts."""
+FAINT = -20.0
+"""Log alpha is clamped to this, far below ALPHA_MIN, as exp takes 15 to 35 times longer where its result underflows."""
+
+
+@dataclass(frozen=True)
+class _Lists:
+    """The splats of all tiles, and what blending needs to know of them."""
+
+    ids: Tensor             # int32 [M]
+    starts: Tensor          # int64 [tiles]
+    counts: Tensor          # int64 [tiles]
+    records: Tensor         # [C N, 6]
+    colors: Tensor          # [C N or N, D]
+    shared: int             # N if all cameras share the colours, else 0
+    alpha_max: float
+    shape: tuple[int, int, int]     # C, tiles_y, tiles_x
+    tile: int
+    monomials: Tensor       # [6, P]
+
+    def rounds(self, light: Tensor) -> Iterator[list[tuple[Tensor, int, int]]]:
+        """What is to do, front to back: groups of live tiles, longest lists first, with the range of list positions.
+
+        `light` `[tiles, P]`, the transmittance, is read between rounds; the groups of a round are independent.
+        """
+        size = max(1, GROUP * 8 // (CHUNK * max(8, self.colors.shape[1])))
+        live = self.counts.sort(descending=True, stable=True).indices[:int((self.counts > 0).sum())]
+        begin = 0
+        while len(live):
+            yield [(tiles, begin, min(CHUNK, int(self.counts[tiles[0]]) - begin)) for tiles in live.split(size)]
+            begin += CHUNK
+            live = live[:int((self.counts[live] > begin).sum())]
+            live = live[light[live].amax(1) > TRANSMITTANCE_MIN]
+
+    def group(self, tiles: Tensor, begin: int, k: int) -> _Group:
+        """The splats begin..begin + k of the tiles."""
+        at = (self.starts[tiles] + begin)[:, None] + torch.arange(k)                        # [G, K]
+        padding = torch.arange(begin, begin + k) >= self.counts[tiles, None]
+        splats = self.ids.index_select(0, at.clamp_(max=len(self.ids) - 1).flatten()).long()
+        record = self.records.index_select(0, splats).T.contiguous().view(6, *at.shape)    # a row is in one cache line
+        record[5].masked_fill_(padding, footprint.NOTHING)
+        cx = (tiles % self.shape[2] * self.tile).to(record.dtype) + self.tile / 2
+        cy = (tiles // self.shape[2] % self.shape[1] * self.tile).to(record.dtype) + self.tile / 2
+        rows = splats % self.shared if self.shared else splats
+        colors = torch.cat([self.colors.index_select(0, rows), self.colors.new_ones(len(rows), 1)], -1)
+        return _Group(tiles, splats, rows, record, cx[:, None] - record[0], cy[:, None] - record[1], colors.view(*at.shape, -1),
+                      bool((record[5] >= math.log(self.alpha_max)).any()))
+
+
+class _Group(NamedTuple):
+    """G tiles with K splats each. (Indices are int64: index_add is 20 times slower with int32.)"""
+
+    tiles: Tensor           # [G]
+    splats: Tensor          # [G K]
+    rows: Tensor            # [G K], of the colours
+    record: Tensor          # [6, G, K]
+    qx: Tensor              # [G, K], tile centre minus mean
+    qy: Tensor
+    colors: Tensor          # [G, K, D + 1]; the last channel is 1, for alpha
+    clamps: bool            # whether alpha can reach its clamp
+
+
+def _lists(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ids: Tensor, offsets: Tensor, width: int, height: int,
+           tile: int, alpha_max: float) -> _Lists:
+    C, N = opacities.shape
+    tiles_x, tiles_y = tile_counts(width, height, tile)
+    return _Lists(ids, offsets[:-1], offsets.diff(), footprint.records(means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten()).T.contiguous(),
+                  colors.reshape(-1, colors.shape[-1]), N if len(colors) < C else 0, alpha_max,
+                  (C, tiles_y, tiles_x), tile, footprint.monomials(tile, means2d.dtype, means2d.device))
+
+
+class _Memory:
+    """Scratch memory for blocks: so many arrays `[B, P, K]`, which the blocks of a group, and then other groups, reuse."""
+
+    def __init__(self, lists: _Lists, buffers: int) -> None:
+        self.pixels = lists.tile**2
+        self.tiles = max(1, BLOCK // (self.pixels * max(CHUNK, lists.colors.shape[1])))     # many channels: they set the working set
+        self.shape = buffers, self.tiles * self.pixels * CHUNK
+        self.like = lists.records
+        self.free: list[Tensor] = []
+
+    def blocks(self, group: _Group) -> Iterator[tuple[slice, tuple[Tensor, ...]]]:
+        """Blocks of a group: its rows, and the arrays, contiguous."""
+        memory = self.free.pop() if self.free else self.like.new_empty(self.shape)
+        g, k = group.qx.shape
+        for i in range(0, g, self.tiles):
+            b = min(self.tiles, g - i)
+            yield slice(i, i + b), memory[:, :b * self.pixels * k].view(-1, b, self.pixels, k).unbind(0)
+        self.free.append(memory)
+
+
+def _weights(lists: _Lists, coefficients: Tensor, clamp: bool, light: Tensor, alpha: Tensor, weight: Tensor, T: Tensor) -> None:
+    """Fill in alpha, weight (alpha times the transmittance in front) and T (behind).
+
+    `light` `[B, P]` is the transmittance in front of the chunk, and behind it on return.
+    """
+    torch.matmul(lists.monomials.T, coefficients, out=alpha)
+    alpha.clamp_(min=FAINT).exp_()
+    if clamp:
+        alpha.clamp_(max=lists.alpha_max)
+    torch.nn.functional.threshold_(alpha, ALPHA_MIN, 0.0)
+    torch.sub(1, alpha, out=weight)
+    weight[..., 0].mul_(light)
+    torch.cumprod(weight, -1, out=T)
+    torch.div(T, weight, out=weight)                        # T in front: cheaper than a shifted copy, and 1 - alpha >= 1 - alpha_max
+    weight[..., 0] = light
+    torch.nn.functional.threshold_(weight, TRANSMITTANCE_MIN, 0.0).mul_(alpha)
+    light.copy_(T[..., -1])
+
+
+def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
+                 offsets: Tensor, width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
+    """As `blending.blend`, without autograd. Working memory beyond inputs and outputs: one number per pixel and channel, and constants."""
+    lists = _lists(means2d, conics, opacities, colors, ids, offsets, width, height, tile, alpha_max)
+    D = colors.shape[-1]
+    light = _light(lists, width, height)
+    image = light.new_zeros(len(light), D + 1, tile * tile)
+    memory = _Memory(lists, 3)
+
+    def blend_group(piece: tuple[Tensor, int, int]) -> tuple[Tensor, Tensor]:
+        group = lists.group(*piece)
+        coefficients = footprint.coefficients(group.record, group.qx, group.qy)
+        group_light = light.index_select(0, group.tiles)
+        group_image = image.new_empty(len(group.tiles), D + 1, tile * tile)
+        for part, (alpha, weight, T) in memory.blocks(group):
+            _weights(lists, coefficients[part], group.clamps, group_light[part], alpha, weight, T)
+            torch.bmm(group.colors[part].mT, weight.mT, out=group_image[part])
+        light.index_copy_(0, group.tiles, group_light)
+        return group.tiles, group_image
+
+    with workers() as ordered_map:
+        for groups in lists.rounds(light):
+            for tiles, group_image in ordered_map(blend_group, groups):
+                image.index_add_(0, tiles, group_image)
+    full = to_image(image, lists.shape, width, height)
+    alphas = full[..., D].contiguous()
+    if backgrounds is None:
+        return full[..., :D].contiguous(), alphas
+    return torch.addcmul(full[..., :D], (1 - alphas)[..., None], backgrounds[:, None, None]), alphas
+
+
+def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
+                          offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int,
+                          tile: int, alpha_max: float, absgrad: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Closed-form gradients of `blend` with respect to means2d, conics, opacities, colors and backgrounds.
+
+    With L the loss, g_i = <c_i - background, dL/dimage> + dL/dalpha and the rest R_i = sum_{j > i} w_j g_j:
+    dL/dlog alpha_i = w_i g_i - alpha_i/(1 - alpha_i) R_i = w_i (g_i - R_i/T_{i+1}).
+    Front to back, R starts as the sum over all splats, which is known from the image, and loses one term at each.
+
+    The sixth result is the absolute gradient `[C, N, 2]`: sum over pixels of |dL/dmean2d| per axis (AbsGS); empty unless asked for.
+    """
+    lists = _lists(means2d, conics, opacities, colors, ids, offsets, width, height, tile, alpha_max)
+    C, N, D = *opacities.shape, colors.shape[-1]
+    if backgrounds is None:
+        v_backgrounds, behind = v_image.new_zeros(C, D), torch.zeros_like(v_alphas)
+    else:
+        v_backgrounds = torch.einsum("chwd,chw->cd", v_image, 1 - alphas)
+        behind = torch.einsum("chwd,cd->chw", v_image, backgrounds)                         # <background, dL/dimage>
+    upstream = to_tiles(torch.cat([v_image, (v_alphas - behind)[..., None]], -1), tile)     # [tiles, D + 1, P]
+    rest = to_tiles(((image * v_image).sum(-1) + alphas * v_alphas - behind)[..., None], tile)[:, 0]
+    light = _light(lists, width, height)
+    v_records, v_colors = lists.records.new_zeros(6, C * N), colors.new_zeros(D, len(lists.colors))
+    v_abs = means2d.new_zeros(2, C * N if absgrad else 0)
+    memory = _Memory(lists, 5)
+
+    def backward_group(piece: tuple[Tensor, int, int]) -> tuple[_Group, Tensor, Tensor, list[Tensor]]:
+        group = lists.group(*piece)
+        coefficients = footprint.coefficients(group.record, group.qx, group.qy)
+        slopes = footprint.mean_slopes(group.record, group.qx, group.qy) if absgrad else ()
+        group_light, group_rest, group_upstream = (v.index_select(0, group.tiles) for v in (light, rest, upstream))
+        moments, v_color = torch.empty_like(coefficients), colors.new_empty(len(group.tiles), D, group.qx.shape[1])
+        sums = [torch.empty_like(group.qx) for _ in slopes]
+        for part, (alpha, weight, T, v, product) in memory.blocks(group):
+            _weights(lists, coefficients[part], group.clamps, group_light[part], alpha, weight, T)
+            torch.bmm(group_upstream[part].mT, group.colors[part].mT, out=v)                # g
+            torch.bmm(group_upstream[part, :D], weight, out=v_color[part])
+            _log_alpha_gradient(v, weight, T, product, group_rest[part])
+            if group.clamps:
+                v.masked_fill_(alpha >= alpha_max, 0.0)
+            torch.matmul(lists.monomials, v, out=moments[part])
+            for slope, sum_abs in zip(slopes, sums, strict=True):
+                torch.matmul(lists.monomials[:3].T, slope[part], out=T)
+                torch.sum(T.mul_(v).abs_(), 1, out=sum_abs[part])
+        light.index_copy_(0, group.tiles, group_light)
+        rest.index_copy_(0, group.tiles, group_rest)
+        return group, footprint.coefficients_backward(group.record, group.qx, group.qy, moments), v_color, sums
+
+    with workers() as ordered_map:
+        for groups in lists.rounds(light):
+            for group, v_record, v_color, sums in ordered_map(backward_group, groups):
+                v_records.index_add_(1, group.splats, v_record.flatten(1))
+                v_colors.index_add_(1, group.rows, v_color.transpose(0, 1).reshape(D, -1))
+                for axis, sum_abs in enumerate(sums):
+                    v_abs[axis].index_add_(0, group.splats, sum_abs.flatten())
+    v_means2d, v_conics, v_opacities = footprint.records_backward(conics.reshape(-1, 3), opacities.flatten(), v_records)
+    return (v_means2d.view_as(means2d), v_conics.view_as(conics), v_opacities.view_as(opacities), v_colors.T.reshape(colors.shape),
+            v_backgrounds, v_abs.T.reshape(C, -1, 2))
+
+
+def _log_alpha_gradient(v: Tensor, weight: Tensor, T: Tensor, product: Tensor, rest: Tensor) -> None:
+    """Turn v from g into dL/dlog alpha, in place, using up T and `product`; `rest` `[B, P]` in front of the chunk becomes that behind."""
+    torch.mul(weight, v, out=product)
+    product[..., 0].sub_(rest)
+    torch.cumsum(product, -1, out=product)                                                  # minus the rest behind each splat
+    torch.neg(product[..., -1], out=rest)
+    v.add_(product.div_(T.clamp_(min=TINY))).mul_(weight)
+
+
+def _light(lists: _Lists, width: int, height: int) -> Tensor:
+    """Light `[tiles, P]` at the start: 1, and 0 at the pixels of the last tiles that are beyond the border."""
+    return to_tiles(lists.records.new_ones(1, height, width, 1), lists.tile)[:, 0].repeat(lists.shape[0], 1)

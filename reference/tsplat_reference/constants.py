@@ -1,0 +1,25 @@
+"""The numbers that decide what is drawn; one home for the reference, and for the kernels, which get them as arguments."""
+
+ALPHA_MIN = 1 / 255
+"""A splat does not touch a pixel where its alpha is below this (3DGS, section 6)."""
+
+ALPHA_MAX = 0.99
+"""Alpha is clamped to this, with zero gradient there (gsplat up to 1.5.3: 0.999)."""
+
+TRANSMITTANCE_MIN = 1e-4
+"""A splat contributes while the transmittance in front of it is above this; what is dropped weighs at most this much."""
+
+EPS2D = 0.3
+"""Added to the diagonal of the projected covariance, in pixels squared: the low-pass filter of EWA splatting."""
+
+EXTENT_MAX = 3.33
+"""Extent of a splat in standard deviations at the most: sqrt(2 ln 255), where an opaque splat falls to ALPHA_MIN."""
+
+FRUSTUM_MARGIN = 0.3
+"""x/z and y/z in the pinhole Jacobian are clamped to the frustum widened by this part of its half size."""
+
+COMPENSATION_MIN = 0.005
+"""Floor of the antialiasing compensation sqrt(det(before blur) / det(after)) (gsplat main and Inria; gsplat 1.5.3: 0)."""
+
+LARGEST = 1e12
+"""Means, scales and square roots of covariances beyond this are degenerate: such splats are culled."""

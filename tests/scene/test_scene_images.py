@@ -1,0 +1,158 @@
+"""Image files and the store: alpha, masks, sizes, the bound on memory, broken files."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+import torch
+from kornia.io import write_image as kornia_write
+from torch import Tensor
+
+from tsplat.scene import ImageStore, Photo, read_image, write_image
+from tsplat.scene.image_files import image_size
+from tsplat.scene.images import load_photo
+
+Ramp = Callable[..., Tensor]
+
+
+@pytest.mark.parametrize("channels", [1, 3, 4])
+def test_round_trip(tmp_path: Path, channels: int) -> None:
+    image = torch.rand(7, 5, channels)
+    write_image(tmp_path / "a.png", image)
+    assert image_size(tmp_path / "a.png") == (5, 7)
+    read = read_image(tmp_path / "a.png")
+    assert read.dtype == torch.uint8
+    assert read.shape == (7, 5, max(channels, 3))
+    assert ((read / 255 - image).abs() <= 0.5 / 255 + 1e-6).all()
+
+
+def test_out_of_range_is_clamped(tmp_path: Path) -> None:
+    write_image(tmp_path / "a.png", torch.tensor([[[-1.0, 2.0, torch.nan], [torch.inf, -torch.inf, 0.5]]]))
+    assert read_image(tmp_path / "a.png").tolist() == [[[0, 255, 0], [255, 0, 128]]]
+
+
+def test_write_refuses(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"image: expected \[H, W, 1\]"):
+        write_image(tmp_path / "a.png", torch.zeros(4, 4, 2))
+    with pytest.raises(TypeError, match="image: expected a floating-point"):
+        write_image(tmp_path / "a.png", torch.zeros(4, 4, 3, dtype=torch.uint8))
+    with pytest.raises(ValueError, match=r"ends in \.png"):
+        write_image(tmp_path / "a.jpg", torch.zeros(4, 4, 3))
+    with pytest.raises(FileNotFoundError, match="folder"):
+        write_image(tmp_path / "no" / "a.png", torch.zeros(4, 4, 3))
+    assert not list(tmp_path.iterdir())
+
+
+def test_other_files(tmp_path: Path, ramp: Ramp) -> None:
+    planes = (ramp(20, 12) * 255).to(torch.uint8).permute(2, 0, 1).contiguous()
+    kornia_write(tmp_path / "a.jpg", planes, quality=95)
+    kornia_write(tmp_path / "grey.jpg", planes[:1].contiguous())
+    kornia_write(tmp_path / "a.tif", planes)
+    kornia_write(tmp_path / "deep.png", planes.to(torch.uint16) * 257)
+    for name in ("a.jpg", "grey.jpg", "a.tif", "deep.png"):
+        assert image_size(tmp_path / name) == (20, 12)
+        assert read_image(tmp_path / name).shape == (12, 20, 3)
+    padded = (tmp_path / "a.jpg").read_bytes()
+    (tmp_path / "padded.jpg").write_bytes(padded[:2] + b"\xff\xff" + padded[2:])      # fill bytes before a marker
+    assert image_size(tmp_path / "padded.jpg") == (20, 12)
+    kornia_write(tmp_path / "float.tif", ramp(20, 12).permute(2, 0, 1).contiguous())
+    with pytest.raises(ValueError, match=r"float\.tif: expected"):
+        read_image(tmp_path / "float.tif")
+    for name in ("a.tif", "deep.png"):
+        assert torch.equal(read_image(tmp_path / name), planes.permute(1, 2, 0))
+
+
+def test_not_an_image(tmp_path: Path) -> None:
+    write_image(tmp_path / "whole.png", torch.rand(40, 40, 3))
+    whole = (tmp_path / "whole.png").read_bytes()
+    contents = {"a.png": b"no image", "a.jpg": b"no image", "empty.jpg": b"", "a.xyz": b"no image",
+                "cut.jpg": b"\xff\xd8\xff\xe0\x00\x04ab", "cut.png": whole[:len(whole) // 2]}
+    for name, content in contents.items():
+        path = tmp_path / name
+        path.write_bytes(content)
+        with pytest.raises(ValueError, match=name):
+            read_image(path)
+        if name != "cut.png":
+            with pytest.raises(ValueError, match=name):
+                image_size(path)
+        with pytest.raises(ValueError, match=name):
+            ImageStore([Photo(path, 4, 4)])[0]
+    with pytest.raises(FileNotFoundError):
+        read_image(tmp_path / "absent.png")
+
+
+@pytest.mark.parametrize("factor", [1, 2, 3, 1.5, 4])
+def test_reduction_averages(tmp_path: Path, factor: float) -> None:
+    width, height = round(24 / factor), round(12 / factor)
+    image = torch.rand(12, 24, 3)
+    write_image(tmp_path / "a.png", image)
+    reduced = load_photo(Photo(tmp_path / "a.png", width, height)) / 255
+    assert reduced.shape == (height, width, 3)
+    assert (reduced.mean((0, 1)) - image.mean((0, 1))).abs().max() < 0.02
+    if factor in (2, 3, 4):
+        k = int(factor)
+        expected = image.view(height, k, width, k, 3).mean((1, 3))
+        assert (reduced - expected).abs().max() < 1.01 / 255
+
+
+def test_reduction_weights_by_alpha(tmp_path: Path) -> None:
+    image = torch.zeros(2, 4, 4)
+    image[:, 0] = torch.tensor([1.0, 0.5, 0.25, 1.0])               # the left of the first block is opaque,
+    image[:, 1] = torch.tensor([0.0, 1.0, 0.0, 0.0])                # its right transparent, in another colour
+    write_image(tmp_path / "a.png", image)
+    reduced = load_photo(Photo(tmp_path / "a.png", 2, 1)) / 255
+    torch.testing.assert_close(reduced[0, 0], torch.tensor([1.0, 0.5, 0.25, 0.5]), atol=2 / 255, rtol=0)
+    assert reduced[0, 1].tolist() == [0, 0, 0, 0]
+
+
+def test_mask(tmp_path: Path, ramp: Ramp) -> None:
+    write_image(tmp_path / "a.png", ramp(8, 4))
+    mask = torch.zeros(8, 16, 1)
+    mask[:, 8:] = 1
+    write_image(tmp_path / "mask.png", mask)                        # of twice the size
+    image = ImageStore([Photo(tmp_path / "a.png", 8, 4, mask=tmp_path / "mask.png")])[0]
+    assert image.shape == (4, 8, 4)
+    assert image[:, :4, 3].eq(0).all()
+    assert image[:, 4:, 3].eq(1).all()
+    assert (image[..., :3] - ramp(8, 4)).abs().max() < 1 / 255      # colours under the mask stay
+    write_image(tmp_path / "b.png", torch.cat([ramp(8, 4), torch.full((4, 8, 1), 0.6)], dim=2))
+    both = ImageStore([Photo(tmp_path / "b.png", 8, 4, mask=tmp_path / "mask.png")])[0]
+    torch.testing.assert_close(both[..., 3], image[..., 3] * 0.6)
+
+
+def test_store_keeps_within_its_bound(tmp_path: Path, ramp: Ramp, monkeypatch: pytest.MonkeyPatch) -> None:
+    photos = []
+    for i in range(6):
+        write_image(tmp_path / f"{i}.png", ramp(10, 8, phase=float(i)))
+        photos.append(Photo(tmp_path / f"{i}.png", 10, 8))
+    decoded: list[str] = []
+
+    def load(photo: Photo) -> Tensor:
+        decoded.append(photo.path.stem)
+        return load_photo(photo)
+
+    monkeypatch.setattr("tsplat.scene.images.load_photo", load)
+    size = 10 * 8 * 3
+    store = ImageStore(photos, cache_bytes=3 * size + size // 2)
+    assert len(store) == 6
+    for i in (0, 1, 2, 0, 3, 0, 2, 1):                              # 3 takes the place of 1, then 1 that of 3
+        image = store[i]
+        assert image.dtype == torch.float32
+        assert (image - ramp(10, 8, phase=float(i))).abs().max() < 1 / 255
+        assert store.held_bytes <= 3 * size
+    assert decoded == ["0", "1", "2", "3", "1"]
+    image = store[1]
+    image.zero_()                                                   # a caller's changes do not reach the cache
+    assert store[1].any()
+    assert torch.equal(store[-1], store[5])
+    with pytest.raises(IndexError):
+        store[6]
+
+    decoded.clear()
+    small = ImageStore(photos, cache_bytes=size - 1)
+    for _ in range(2):
+        assert small[0].shape == (8, 10, 3)
+    assert decoded == ["0", "0"]
+    assert small.held_bytes == 0
+    with pytest.raises(ValueError, match="cache_bytes"):
+        ImageStore(photos, cache_bytes=-1)

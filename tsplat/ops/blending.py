@@ -1,0 +1,98 @@
+"""Blending as a custom op: CPU tensors run the reference, in blocks."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import tsplat_reference as reference
+from torch import Tensor
+from torch.library import custom_op
+
+from tsplat.ops.common import no_kernel, register_autocast, reject_forward_mode, second_derivative
+
+Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None,
+          ids: Tensor, offsets: Tensor, width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
+    """`tsplat_reference.blend` as an op, with gradients to means2d, conics, opacities, colors and backgrounds.
+
+    `absgrad` `[C, N, 2]` changes nothing in the result; as its gradient it receives the sum over pixels of |dL/dmeans2d|.
+    """
+    reject_forward_mode("blend", means2d, conics, opacities, colors, backgrounds)
+    return blend_op(means2d, conics, opacities, colors, backgrounds, absgrad, ids, offsets, width, height, tile, alpha_max)
+
+
+@custom_op("tsplat::blend", mutates_args=())
+def blend_op(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None,
+             ids: Tensor, offsets: Tensor, width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
+    """image and alpha."""
+    no_kernel("blend", means2d)
+
+
+@custom_op("tsplat::blend_backward", mutates_args=())
+def blend_backward_op(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
+                      offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int,
+                      tile: int, alpha_max: float, absgrad: bool) -> Six:
+    """Gradients of means2d, conics, opacities, colors and backgrounds, and the absolute gradient, `[C, 0, 2]` unless asked for."""
+    no_kernel("blend_backward", means2d)
+
+
+@blend_op.register_kernel("cpu")
+def _blend_cpu(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None,
+               *lists: Any) -> tuple[Tensor, Tensor]:
+    return reference.blend_blocks(means2d, conics, opacities, colors, backgrounds, *lists)
+
+
+blend_backward_op.register_kernel("cpu")(reference.blend_blocks_backward)
+
+
+@blend_op.register_fake
+def _blend_fake(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None,
+                ids: Tensor, offsets: Tensor, width: int, height: int, *_: Any) -> tuple[Tensor, Tensor]:
+    shape = means2d.shape[0], height, width
+    return colors.new_empty(*shape, colors.shape[2]), colors.new_empty(shape)
+
+
+@blend_backward_op.register_fake
+def _blend_backward_fake(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
+                         offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int,
+                         tile: int, alpha_max: float, absgrad: bool) -> Six:
+    C, N = opacities.shape
+    return (*(x.new_empty(x.shape) for x in (means2d, conics, opacities, colors)), colors.new_empty(C, colors.shape[2]),
+            means2d.new_empty(C, N if absgrad else 0, 2))  # type: ignore[return-value]
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
+    means2d, conics, opacities, colors, backgrounds, absgrad, ids, offsets, *ctx.options = inputs
+    ctx.absgrad = absgrad is not None
+    ctx.save_for_backward(means2d, conics, opacities, colors, backgrounds, ids, offsets, *output)
+
+
+def _backward(ctx: Any, v_image: Tensor, v_alphas: Tensor) -> tuple[Any, ...]:
+    tensors = ctx.saved_tensors
+    *v_inputs, v_backgrounds, v_abs = blend_backward_op(*tensors, v_image.contiguous(), v_alphas.contiguous(), *ctx.options, ctx.absgrad)
+    return *v_inputs, v_backgrounds if tensors[4] is not None else None, v_abs if ctx.absgrad else None, *[None] * 6
+
+
+def _save_backward(ctx: Any, inputs: tuple[Any, ...], output: Six) -> None:
+    *differentiable, ids, offsets, _, _, v_image, v_alphas = inputs[:11]
+    ctx.options = inputs[11:15]
+    ctx.save_for_backward(*differentiable, ids, offsets, v_image, v_alphas)
+
+
+def _double_backward(ctx: Any, *v_gradients: Tensor) -> tuple[Any, ...]:
+    means2d, conics, opacities, colors, backgrounds, ids, offsets, v_image, v_alphas = ctx.saved_tensors
+
+    def forward(*inputs: Any) -> tuple[Tensor, Tensor]:
+        return reference.blend(*inputs, ids, offsets, *ctx.options)
+
+    inputs = means2d, conics, opacities, colors, backgrounds
+    v_inputs, v_cotangents = second_derivative(forward, inputs, (v_image, v_alphas), v_gradients[:5])
+    return *v_inputs, *[None] * 4, *v_cotangents, *[None] * 5
+
+
+blend_op.register_autograd(_backward, setup_context=_save)
+blend_backward_op.register_autograd(_double_backward, setup_context=_save_backward)
+register_autocast(blend_op, blend_backward_op)

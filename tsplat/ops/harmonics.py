@@ -1,0 +1,78 @@
+"""Spherical harmonics as a custom op: CPU tensors run the reference."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import tsplat_reference as reference
+from torch import Tensor
+from torch.library import custom_op
+
+from tsplat.ops.common import no_kernel, register_autocast, register_loop_vmap, reject_forward_mode, second_derivative
+
+Three = tuple[Tensor, Tensor, Tensor]
+
+
+def harmonics(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:
+    """`tsplat_reference.harmonics` as an op, with gradients to means, centers and coeffs."""
+    reject_forward_mode("harmonics", means, centers, coeffs)
+    return harmonics_op(means, centers, coeffs, degree, mask)
+
+
+@custom_op("tsplat::harmonics", mutates_args=())
+def harmonics_op(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:
+    """`[C, N, D]`."""
+    no_kernel("harmonics", means)
+
+
+@custom_op("tsplat::harmonics_backward", mutates_args=())
+def harmonics_backward_op(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor, v_out: Tensor) -> Three:
+    """Gradients of means, centers and coeffs."""
+    no_kernel("harmonics_backward", means)
+
+
+harmonics_op.register_kernel("cpu")(reference.harmonics)
+harmonics_backward_op.register_kernel("cpu")(reference.harmonics_backward)
+
+
+@harmonics_op.register_fake
+def _harmonics_fake(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:
+    return coeffs.new_empty(centers.shape[0], means.shape[0], coeffs.shape[2])
+
+
+@harmonics_backward_op.register_fake
+def _harmonics_backward_fake(means: Tensor, centers: Tensor, coeffs: Tensor, *_: Any) -> Three:
+    return torch.empty_like(means), torch.empty_like(centers), torch.empty_like(coeffs)
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+    means, centers, coeffs, ctx.degree, mask = inputs
+    ctx.save_for_backward(means, centers, coeffs, mask)
+
+
+def _backward(ctx: Any, v_out: Tensor) -> tuple[Any, ...]:
+    means, centers, coeffs, mask = ctx.saved_tensors
+    v_means, v_centers, v_coeffs = harmonics_backward_op(means, centers, coeffs, ctx.degree, mask, v_out.contiguous())
+    return v_means, v_centers, v_coeffs, None, None
+
+
+def _save_backward(ctx: Any, inputs: tuple[Any, ...], output: Three) -> None:
+    means, centers, coeffs, ctx.degree, mask, v_out = inputs
+    ctx.save_for_backward(means, centers, coeffs, mask, v_out)
+
+
+def _double_backward(ctx: Any, *v_gradients: Tensor) -> tuple[Any, ...]:
+    means, centers, coeffs, mask, v_out = ctx.saved_tensors
+
+    def forward(means: Tensor, centers: Tensor, coeffs: Tensor) -> list[Tensor]:
+        return [reference.harmonics(means, centers, coeffs, ctx.degree, mask)]
+
+    v_inputs, (v_v_out,) = second_derivative(forward, (means, centers, coeffs), (v_out,), v_gradients)
+    return *v_inputs, None, None, v_v_out
+
+
+harmonics_op.register_autograd(_backward, setup_context=_save)
+harmonics_backward_op.register_autograd(_double_backward, setup_context=_save_backward)
+register_autocast(harmonics_op, harmonics_backward_op)
+register_loop_vmap(harmonics_op, harmonics_backward_op)

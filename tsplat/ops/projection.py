@@ -1,0 +1,101 @@
+"""Projection of Gaussians to 2D splats as a custom op: CPU tensors run the reference."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import tsplat_reference as reference
+from torch import Tensor
+from torch.library import custom_op
+from tsplat_reference import Projection
+
+from tsplat.ops.common import no_kernel, register_autocast, register_loop_vmap, reject_forward_mode, second_derivative
+
+Five = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
+Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+
+
+def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor, viewmats: Tensor,
+            Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float, antialiased: bool) -> Projection:
+    """`tsplat_reference.project` as an op, with gradients to means, quats, scales, covars, viewmats and Ks."""
+    reject_forward_mode("project", means, quats, scales, covars, opacities, viewmats, Ks)
+    return Projection(*project_op(means, quats, scales, covars, opacities, viewmats, Ks, width, height, model, near, far, eps2d, antialiased))
+
+
+@custom_op("tsplat::project", mutates_args=())
+def project_op(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor, viewmats: Tensor,
+               Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float, antialiased: bool) -> Five:
+    """radii, means2d, depths, conics, compensations."""
+    no_kernel("project", means)
+
+
+@custom_op("tsplat::project_backward", mutates_args=())
+def project_backward_op(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
+                        viewmats: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float,
+                        antialiased: bool, radii: Tensor, v_means2d: Tensor, v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor
+                        ) -> Six:
+    """Gradients of means, quats, scales, covars, viewmats and Ks, empty for those that are None."""
+    no_kernel("project_backward", means)
+
+
+@project_op.register_kernel("cpu")
+def _project_cpu(*args: Any) -> Five:
+    return tuple(reference.project(*args))
+
+
+@project_backward_op.register_kernel("cpu")
+def _project_backward_cpu(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
+                          viewmats: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float,
+                          antialiased: bool, *gradients: Tensor) -> Six:
+    results = reference.project_backward(means, quats, scales, covars, viewmats, Ks, width, height, model, eps2d, antialiased, *gradients)
+    return tuple(means.new_empty(0) if r is None else r for r in results)  # type: ignore[return-value]
+
+
+@project_op.register_fake
+def _project_fake(means: Tensor, quats: Any, scales: Any, covars: Any, opacities: Any, viewmats: Tensor, *_: Any) -> Five:
+    shape = viewmats.shape[0], means.shape[0]
+    return (means.new_empty(*shape, 2, dtype=torch.int32), means.new_empty(*shape, 2), means.new_empty(*shape), means.new_empty(*shape, 3),
+            means.new_empty(*shape))
+
+
+@project_backward_op.register_fake
+def _project_backward_fake(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
+                           viewmats: Tensor, Ks: Tensor, *_: Any) -> Six:
+    return tuple(means.new_empty(0 if x is None else x.shape) for x in (means, quats, scales, covars, viewmats, Ks))  # type: ignore[return-value]
+
+
+def _save(ctx: Any, inputs: tuple[Any, ...], output: Five) -> None:
+    tensors, ctx.options = inputs[:7], inputs[7:]
+    ctx.mark_non_differentiable(output[0])
+    ctx.set_materialize_grads(True)
+    ctx.save_for_backward(*tensors, output[0])
+
+
+def _backward(ctx: Any, _: Any, *gradients: Tensor) -> tuple[Any, ...]:
+    *tensors, radii = ctx.saved_tensors
+    results = project_backward_op(*tensors, *ctx.options, radii, *(v.contiguous() for v in gradients))
+    v_means, v_quats, v_scales, v_covars, v_viewmats, v_Ks = (
+        None if x is None else r for x, r in zip((*tensors[:4], *tensors[5:]), results, strict=True))
+    return v_means, v_quats, v_scales, v_covars, None, v_viewmats, v_Ks, *[None] * 7
+
+
+def _save_backward(ctx: Any, inputs: tuple[Any, ...], output: Six) -> None:
+    ctx.options = inputs[7:14]
+    ctx.save_for_backward(*inputs[:7], *inputs[15:])
+
+
+def _double_backward(ctx: Any, *v_gradients: Tensor) -> tuple[Any, ...]:
+    means, quats, scales, covars, opacities, viewmats, Ks, *cotangents = ctx.saved_tensors
+
+    def forward(means: Tensor, quats: Any, scales: Any, covars: Any, viewmats: Tensor, Ks: Tensor) -> list[Tensor]:
+        return list(reference.project(means, quats, scales, covars, opacities, viewmats, Ks, *ctx.options)[1:])
+
+    v_inputs, v_cotangents = second_derivative(forward, (means, quats, scales, covars, viewmats, Ks), cotangents, v_gradients)
+    return *v_inputs[:4], None, *v_inputs[4:], *[None] * 8, *v_cotangents
+
+
+project_op.register_autograd(_backward, setup_context=_save)
+project_backward_op.register_autograd(_double_backward, setup_context=_save_backward)
+register_autocast(project_op, project_backward_op)
+register_loop_vmap(project_op, project_backward_op)

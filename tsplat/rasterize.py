@@ -1,0 +1,166 @@
+"""`rasterize`: Gaussians and a camera to an image, in one differentiable call."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import torch
+from torch import Tensor
+from tsplat_reference import camera_centers, tile_counts
+from tsplat_reference.constants import ALPHA_MAX, EPS2D
+
+from tsplat import ops
+from tsplat.camera import Camera
+from tsplat.checks import check_choice, check_size, check_tensor
+
+TILE = 8
+"""Pixels along the side of a tile. On a CPU 8 beats 4, 6 and 16: smaller tiles have more hits to sort, larger ones more idle pairs."""
+MAX_DEGREE = 4
+
+DepthMode = Literal["accumulated", "expected"]
+
+
+class Meta(NamedTuple):
+    """What happened on the way, for C cameras and N Gaussians.
+
+    radii: int32 `[C, N, 2]`, half size in pixels of the box that a splat can touch; 0 if it is culled.
+    means2d: `[C, N, 2]` in pixels; part of the graph (`meta.means2d.retain_grad()`).
+    depths: `[C, N]`, camera z.
+    hits: int64 `[C, tiles_y, tiles_x]`, splats per tile.
+    """
+
+    radii: Tensor
+    means2d: Tensor
+    depths: Tensor
+    hits: Tensor
+
+    @property
+    def visible(self) -> Tensor:
+        """Bool `[C, N]`: which splats were drawn."""
+        return (self.radii > 0).all(-1)
+
+    @property
+    def visible_ids(self) -> Tensor:
+        """Int64 `[V, 2]`: camera and Gaussian of the splats that were drawn."""
+        return self.visible.nonzero()
+
+
+class Rendering(NamedTuple):
+    """Result of `rasterize`, with a leading dimension C where the camera is a batch.
+
+    image: `[(C,) H, W, D]`. alpha: `[(C,) H, W]`, 1 minus the background's weight. depth: `[(C,) H, W]` or None.
+    """
+
+    image: Tensor
+    alpha: Tensor
+    depth: Tensor | None
+    meta: Meta
+
+
+def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, colors: Tensor, camera: Camera, *,
+              sh_degree: int | None = None, covars: Tensor | None = None, background: Tensor | None = None,
+              depth: DepthMode | None = None, antialiased: bool = False, eps2d: float = EPS2D, alpha_max: float = ALPHA_MAX,
+              screen_offset: Tensor | None = None, absgrad: Tensor | None = None, tile: int = TILE) -> Rendering:
+    """Render N Gaussians (3D Gaussian Splatting, sections 4 and 6).
+
+    Differentiable in means, quats, scales or covars, opacities, colors, background, screen_offset and the camera's matrices;
+    twice, too. Gaussians that are degenerate (not finite, zero quaternion or scale, out of range) are left out and get zero gradient.
+
+    Args:
+        means: `[N, 3]`.
+        quats: `[N, 4]` (w, x, y, z), normalised inside.
+        scales: `[N, 3]` standard deviations along the axes. quats and scales are None if `covars` is given.
+        opacities: `[N]` in [0, 1].
+        colors: `[N, D]` or `[C, N, D]`, any D from 1; or with `sh_degree` SH coefficients `[N, K, D]`, K >= (sh_degree + 1)^2, of which a
+            colour max(SH + 0.5, 0) is made in each camera's direction.
+        camera: one or a batch of C cameras.
+        sh_degree: 0 to 4: the bands to use of SH coefficients in `colors`.
+        covars: `[N, 3, 3]` symmetric covariances.
+        background: `[D]` or `[C, D]`, default zeros.
+        depth: also render camera z: `"accumulated"`, sum of weight times z, or `"expected"`, that divided by alpha.
+        antialiased: scale opacities by what the blur `eps2d` added to each splat's area (Mip-Splatting's 2D filter).
+        eps2d: added to the diagonal of the projected covariance, in pixels squared.
+        alpha_max: clamp of alpha, in (0, 1); zero gradient where it acts. (gsplat up to 1.5.3: 0.999.)
+        screen_offset: `[C, N, 2]` in pixels, added to the projected means. Pass zeros that require grad to get the screen-space
+            gradient that density control needs, under torch.compile as well.
+        absgrad: `[C, N, 2]` that requires grad; changes nothing, and receives the sum over pixels of |dL/dmean2d| (AbsGS).
+        tile: pixels along the side of a tile; never visible in the result.
+
+    Raises:
+        ValueError, TypeError: naming the argument, what came and what is expected.
+        NotImplementedError: on a device without kernels, and for forward-mode derivatives.
+    """
+    _check(means, quats, scales, opacities, colors, camera, sh_degree, covars, background, depth, eps2d, alpha_max, screen_offset, absgrad,
+           tile)
+    C, width, height = len(camera), camera.width, camera.height
+    viewmats, Ks = camera.viewmats.reshape(-1, 4, 4), camera.Ks.reshape(-1, 3, 3)
+    radii, means2d, depths, conics, compensations = ops.project(
+        means, quats, scales, covars, opacities, viewmats, Ks, width, height, camera.model, camera.near, camera.far, eps2d, antialiased)
+    if screen_offset is not None:
+        means2d = means2d + screen_offset
+    view_opacities = opacities * compensations if antialiased else opacities.expand(C, -1)
+
+    visible = (radii > 0).all(-1)
+    if sh_degree is not None:
+        view_colors = (ops.harmonics(means, camera_centers(viewmats), colors, sh_degree, visible) + 0.5).clamp_min(0.0)
+    else:
+        view_colors = colors if colors.ndim == 3 else colors[None]
+    backgrounds = None if background is None else background.expand(C, -1)
+    if depth is not None:
+        view_colors = torch.cat([view_colors.expand(C, -1, -1), depths[..., None]], -1)
+        backgrounds = None if backgrounds is None else torch.nn.functional.pad(backgrounds, (0, 1))
+    radii = torch.where((visible & view_colors.isfinite().all(-1))[..., None], radii, 0)
+
+    bins = ops.bin_splats(means2d, radii, conics, view_opacities, depths, width, height, tile)
+    image, alpha = ops.blend(means2d, conics, view_opacities, view_colors, backgrounds, absgrad, bins.ids, bins.offsets, width, height,
+                             tile, alpha_max)
+    z = None
+    if depth is not None:
+        image, z = image[..., :-1], image[..., -1]
+        z = z / alpha.clamp_min(1e-10) if depth == "expected" else z
+    meta = Meta(radii, means2d, depths, bins.offsets.diff().view(C, *reversed(tile_counts(width, height, tile))))
+    if camera.batched:
+        return Rendering(image, alpha, z, meta)
+    return Rendering(image[0], alpha[0], None if z is None else z[0], meta)
+
+
+def _check(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, colors: Tensor, camera: Camera,
+           sh_degree: int | None, covars: Tensor | None, background: Tensor | None, depth: str | None, eps2d: float, alpha_max: float,
+           screen_offset: Tensor | None, absgrad: Tensor | None, tile: int) -> None:
+    """Errors that name the argument, what came and what is expected."""
+    check_tensor("means", means, ("N", 3))
+    N, C = means.shape[0], len(camera)
+    if covars is None:
+        check_tensor("quats", quats, (N, 4), like=means)
+        check_tensor("scales", scales, (N, 3), like=means)
+    else:
+        check_tensor("covars", covars, (N, 3, 3), like=means)
+        if quats is not None or scales is not None:
+            raise ValueError("covars: expected quats and scales to be None where covars is given")
+    check_tensor("opacities", opacities, (N,), like=means)
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera: expected a tsplat.Camera; got {type(camera).__name__}")
+    check_tensor("camera.viewmats", camera.viewmats, (..., 4, 4), like=means)
+    if sh_degree is None:
+        check_tensor("colors", colors, (N, "D") if getattr(colors, "ndim", 2) < 3 else (C, N, "D"), like=means)
+    else:
+        check_choice("sh_degree", sh_degree, range(MAX_DEGREE + 1))
+        check_tensor("colors", colors, (N, f"K >= {(sh_degree + 1) ** 2}", "D"), like=means)
+        if colors.shape[1] < (sh_degree + 1) ** 2:
+            raise ValueError(f"colors: expected at least {(sh_degree + 1) ** 2} SH coefficients for sh_degree {sh_degree}, shape [N, K, D]; "
+                             f"got {list(colors.shape)}")
+    if colors.shape[-1] < 1:
+        raise ValueError(f"colors: expected at least 1 channel; got shape {list(colors.shape)}")
+    if background is not None:
+        D = colors.shape[-1]
+        check_tensor("background", background, (D,) if getattr(background, "ndim", 1) < 2 else (C, D), like=means)
+    if depth is not None:
+        check_choice("depth", depth, ("accumulated", "expected"))
+    if not 0 <= eps2d < float("inf"):
+        raise ValueError(f"eps2d: expected a number of at least 0, in pixels squared; got {eps2d}")
+    if not 0 < alpha_max < 1:
+        raise ValueError(f"alpha_max: expected a number in (0, 1); got {alpha_max}")
+    for name, probe in (("screen_offset", screen_offset), ("absgrad", absgrad)):
+        if probe is not None:
+            check_tensor(name, probe, (C, N, 2), like=means)
+    check_size("tile", tile)

@@ -147,7 +147,7 @@ def _check(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities
         check_choice("sh_degree", sh_degree, range(MAX_DEGREE + 1))
         check_tensor("colors", colors, (N, f"K >= {(sh_degree + 1) ** 2}", "D"), like=means)
         if colors.shape[1] < (sh_degree + 1) ** 2:
-            raise ValueError(f"colors: expected at least {(sh_degree + 1) ** 2} SH coefficients for sh_degree {sh_degree}, shape [N, K, D]; "
+            raise ValueError(f"colors: expected at least {(sh_degree + 1) ** 2} SH coefficients [N, K, D] for sh_degree {sh_degree}; "
                              f"got {list(colors.shape)}")
     if colors.shape[-1] < 1:
         raise ValueError(f"colors: expected at least 1 channel; got shape {list(colors.shape)}")

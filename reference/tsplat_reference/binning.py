@@ -16,7 +16,8 @@ SLACK_RELATIVE = 1e-4
 
 class Bins(NamedTuple):
     """ids: int32 `[M]`, index c N + n of the splat of each hit, tile by tile, front to back within a tile.
-    offsets: int64 `[C tiles_y tiles_x + 1]`, where each tile's hits begin; the last is M."""
+    offsets: int64 `[C tiles_y tiles_x + 1]`, where each tile's hits begin; the last is M.
+    """
 
     ids: Tensor
     offsets: Tensor
@@ -49,7 +50,7 @@ def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor
     half_height = (level * a / det).sqrt()
     row, last_row = _span(my - half_height, my + half_height, height, tile)
     strip, row = _enumerate(row, last_row)                                                  # [R] splat and tile row of each strip
-    mx, my, a, b, c, level, det, half_height = (v[strip] for v in (mx, my, a, b, c, level, det, half_height))
+    mx, my, a, b, c, level, det, half_height = (v.index_select(0, strip) for v in (mx, my, a, b, c, level, det, half_height))
     low = torch.maximum(row * tile + 0.5 - my, -half_height)                                # the strip's pixel centres, about the mean
     high = torch.minimum(((row + 1) * tile).clamp_max(height) - 0.5 - my, half_height)
     rightmost = -(b / c) * (level * c / det).sqrt()                                         # dy of the ellipse's rightmost point
@@ -58,15 +59,16 @@ def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor
     column, last_column = _span(mx + x_low, mx + x_high, width, tile)
 
     hit, column = _enumerate(column, last_column)                                           # [M] strip and tile column of each hit
-    splat = visible[strip[hit]]
-    key = (splat // n * tiles_y + row[hit]) * tiles_x + column
+    splat = visible.index_select(0, strip)                                                  # [R]
+    first_tile = (splat // n * tiles_y + row) * tiles_x
+    key = first_tile.index_select(0, hit).add_(column)
     key, order = key.to(_narrowest(tiles)).sort(stable=True)
     offsets = torch.searchsorted(key, torch.arange(tiles + 1, device=key.device, dtype=key.dtype))
-    return Bins(splat[order].to(torch.int32), offsets)
+    return Bins(splat.to(torch.int32).index_select(0, hit.index_select(0, order)), offsets)
 
 
 def _edge(dy: Tensor, a: Tensor, b: Tensor, det: Tensor, level: Tensor, side: float) -> Tensor:
-    """dx of the ellipse's right (side 1) or left (side -1) edge at height dy from its centre."""
+    """Dx of the ellipse's right (side 1) or left (side -1) edge at height dy from its centre."""
     return (-b * dy + side * (a * level - det * dy * dy).clamp_min(0.0).sqrt()) / a
 
 
@@ -80,9 +82,9 @@ def _span(low: Tensor, high: Tensor, size: int, tile: int) -> tuple[Tensor, Tens
 def _enumerate(first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
     """All integers of the ranges first..last (inclusive): which range each comes from, and the integer."""
     count = last - first + 1
-    owner = torch.repeat_interleave(torch.arange(len(count), device=count.device), count)
+    owner = torch.repeat_interleave(count)
     start = count.cumsum(0) - count
-    return owner, torch.arange(len(owner), device=count.device) + (first - start)[owner]
+    return owner, (first - start).index_select(0, owner).add_(torch.arange(len(owner), device=count.device))
 
 
 def _sortable(depths: Tensor) -> Tensor:

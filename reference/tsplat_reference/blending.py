@@ -35,11 +35,12 @@ def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ba
         image `[C, H, W, D]` and alpha `[C, H, W]`, 1 - T_final.
     """
     C, N, D = *opacities.shape, colors.shape[-1]
-    shape = C, *reversed(tile_counts(width, height, tile))
+    tiles_x, tiles_y = tile_counts(width, height, tile)
+    shape = C, tiles_y, tiles_x
     counts = offsets.diff()
     parts = []
     longest = int(counts.max()) if len(ids) else 0
-    for tiles in torch.arange(len(counts), device=ids.device).split(max(1, PAIRS // (tile * tile * max(longest, 1)))):
+    for tiles in torch.split(torch.arange(len(counts), device=ids.device), max(1, PAIRS // (tile * tile * max(longest, 1)))):
         k = torch.arange(int(counts[tiles].max()), device=ids.device)
         valid = k < counts[tiles, None]                                                     # [T, K]
         splat = ids[torch.where(valid, offsets[tiles, None] + k, 0)].long() if len(ids) else valid.long()
@@ -75,7 +76,7 @@ def to_tiles(image: Tensor, tile: int) -> Tensor:
 
 
 def _pixel_centers(tiles: Tensor, shape: tuple[int, int, int], tile: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
-    """x and y `[T, P, 1]` of the pixel centres of tiles `[T]`."""
+    """X and y `[T, P, 1]` of the pixel centres of tiles `[T]`."""
     p = torch.arange(tile * tile, device=tiles.device)
     x = (tiles % shape[2] * tile)[:, None] + p % tile
     y = (tiles // shape[2] % shape[1] * tile)[:, None] + p // tile

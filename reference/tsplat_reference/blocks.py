@@ -30,6 +30,8 @@ the calls cost more than that gains (measured from 2^15 to 2^19)."""
 GROUP = 1 << 15
 """Hits of a group of blocks, whose small operations (gathering, coefficients, scattering) are done together, by one thread: about 60
 numbers per hit, 8 MB in float32. With more than 8 channels a group has fewer hits."""
+GROUP_TILES = 128
+"""Where there are few tiles: no smaller groups than this."""
 TINY = 1e-20
 """Below any transmittance that counts; keeps the divisions by it finite where nothing counts."""
 FAINT = -20.0
@@ -56,11 +58,13 @@ class _Lists:
 
         `light` `[tiles, P]`, the transmittance, is read between rounds; the groups of a round are independent.
         """
-        size = max(1, GROUP * 8 // (CHUNK * max(8, self.colors.shape[1])))
         live = self.counts.sort(descending=True, stable=True).indices[:int((self.counts > 0).sum())]
         begin = 0
         while len(live):
-            yield [(tiles, begin, min(CHUNK, int(self.counts[tiles[0]]) - begin)) for tiles in live.split(size)]
+            k = min(CHUNK, int(self.counts[live[0]]) - begin)
+            size = max(1, GROUP * 8 // (k * max(8, self.colors.shape[1])))
+            size = min(size, max(GROUP_TILES, -(-len(live) // 8)))                          # some groups for each core
+            yield [(tiles, begin, min(CHUNK, int(self.counts[tiles[0]]) - begin)) for tiles in torch.split(live, size)]
             begin += CHUNK
             live = live[:int((self.counts[live] > begin).sum())]
             live = live[light[live].amax(1) > TRANSMITTANCE_MIN]
@@ -97,8 +101,8 @@ def _lists(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, i
            tile: int, alpha_max: float) -> _Lists:
     C, N = opacities.shape
     tiles_x, tiles_y = tile_counts(width, height, tile)
-    return _Lists(ids, offsets[:-1], offsets.diff(), footprint.records(means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten()).T.contiguous(),
-                  colors.reshape(-1, colors.shape[-1]), N if len(colors) < C else 0, alpha_max,
+    records = footprint.records(means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten()).T.contiguous()
+    return _Lists(ids, offsets[:-1], offsets.diff(), records, colors.reshape(-1, colors.shape[-1]), N if len(colors) < C else 0, alpha_max,
                   (C, tiles_y, tiles_x), tile, footprint.monomials(tile, means2d.dtype, means2d.device))
 
 
@@ -106,9 +110,8 @@ class _Memory:
     """Scratch memory for blocks: so many arrays `[B, P, K]`, which the blocks of a group, and then other groups, reuse."""
 
     def __init__(self, lists: _Lists, buffers: int) -> None:
-        self.pixels = lists.tile**2
-        self.tiles = max(1, BLOCK // (self.pixels * max(CHUNK, lists.colors.shape[1])))     # many channels: they set the working set
-        self.shape = buffers, self.tiles * self.pixels * CHUNK
+        self.pixels, self.channels = lists.tile**2, lists.colors.shape[1]
+        self.shape = buffers, max(BLOCK, self.pixels * CHUNK)
         self.like = lists.records
         self.free: list[Tensor] = []
 
@@ -116,8 +119,9 @@ class _Memory:
         """Blocks of a group: its rows, and the arrays, contiguous."""
         memory = self.free.pop() if self.free else self.like.new_empty(self.shape)
         g, k = group.qx.shape
-        for i in range(0, g, self.tiles):
-            b = min(self.tiles, g - i)
+        tiles = max(1, BLOCK // (self.pixels * max(k, self.channels)))                      # many channels: they set the working set
+        for i in range(0, g, tiles):
+            b = min(tiles, g - i)
             yield slice(i, i + b), memory[:, :b * self.pixels * k].view(-1, b, self.pixels, k).unbind(0)
         self.free.append(memory)
 
@@ -131,13 +135,13 @@ def _weights(lists: _Lists, coefficients: Tensor, clamp: bool, light: Tensor, al
     alpha.clamp_(min=FAINT).exp_()
     if clamp:
         alpha.clamp_(max=lists.alpha_max)
-    torch.nn.functional.threshold_(alpha, ALPHA_MIN, 0.0)
+    torch.threshold_(alpha, ALPHA_MIN, 0.0)
     torch.sub(1, alpha, out=weight)
     weight[..., 0].mul_(light)
     torch.cumprod(weight, -1, out=T)
     torch.div(T, weight, out=weight)                        # T in front: cheaper than a shifted copy, and 1 - alpha >= 1 - alpha_max
     weight[..., 0] = light
-    torch.nn.functional.threshold_(weight, TRANSMITTANCE_MIN, 0.0).mul_(alpha)
+    torch.threshold_(weight, TRANSMITTANCE_MIN, 0.0).mul_(alpha)
     light.copy_(T[..., -1])
 
 

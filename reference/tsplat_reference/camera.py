@@ -86,7 +86,7 @@ def _frustum(f: Tensor, c: Tensor, size: int) -> tuple[Tensor, Tensor]:
 
 
 def _pinhole_axis(x: Tensor, z: Tensor, f: Tensor, c: Tensor, size: int) -> tuple[Tensor, Tensor, Tensor]:
-    """u = f x/z + c, du/dx = f/z and du/dz = -f clamp(x/z)/z."""
+    """U = f x/z + c, du/dx = f/z and du/dz = -f clamp(x/z)/z."""
     low, high = _frustum(f, c, size)
     t = x / z
     f_z = f / z
@@ -111,7 +111,7 @@ def _pinhole_axis_backward(x: Tensor, z: Tensor, f: Tensor, c: Tensor, size: int
 
 
 def _fisheye_terms(x: Tensor, y: Tensor, z: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """s = theta/r, k = (ds/dr)/r, m = (dk/dr)/r and w = 1/(r^2 + z^2), with r^2 = x^2 + y^2 and theta = atan2(r, z).
+    """S = theta/r, k = (ds/dr)/r, m = (dk/dr)/r and w = 1/(r^2 + z^2), with r^2 = x^2 + y^2 and theta = atan2(r, z).
 
     The equidistant fisheye is u = fx x s + cx. Towards the axis the closed forms cancel, so there the series in (r/z)^2 serves.
     """

@@ -29,7 +29,7 @@ def monomials(tile: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def records(means2d: Tensor, conics: Tensor, opacities: Tensor) -> Tensor:
-    """`[6, R]`: mean x, mean y, h, s, w and log opacity of splats `[R, 2]`, `[R, 3]`, `[R]`; culled splats (conic 0) give finite numbers."""
+    """`[6, R]`: mean x, mean y, h, s, w and log opacity of splats `[R, 2]`, `[R, 3]`, `[R]`; finite for culled ones (conic 0)."""
     a, b, c = conics.unbind(-1)
     s = torch.where(a > 0, b / torch.where(a > 0, a, 1.0), 0.0)
     return torch.stack([*means2d.unbind(-1), 0.5 * a, s, (0.5 * (c - b * s)).clamp_min(0.0),
@@ -56,7 +56,7 @@ def coefficients(record: Tensor, qx: Tensor, qy: Tensor) -> Tensor:
 
 
 def coefficients_backward(record: Tensor, qx: Tensor, qy: Tensor, moments: Tensor) -> Tensor:
-    """Gradients `[6, B, K]` of the records from those of the coefficients: the `moments` `[B, 6, K]`, sums of dL/dlog alpha times monomial."""
+    """Gradients `[6, B, K]` of the records from the `moments` `[B, 6, K]`: sums of dL/dlog alpha times monomial."""
     _, _, h, s, w, _ = record
     m0, mx, my, mxx, mxy, myy = moments.unbind(1)
     u = torch.addcmul(qx, s, qy)

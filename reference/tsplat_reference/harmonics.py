@@ -84,8 +84,7 @@ def harmonics_backward(means: Tensor, centers: Tensor, coeffs: Tensor, degree: i
     if means.shape[0] > CHUNK:
         parts = map_chunks(lambda rows: harmonics_backward(means[rows], centers, coeffs[rows], degree, mask[:, rows], v_out[:, rows]),
                            means.shape[0], CHUNK)
-        v_means, v_centers, v_coeffs = zip(*parts, strict=True)
-        return torch.cat(v_means), torch.stack(v_centers).sum(0), torch.cat(v_coeffs)
+        return (torch.cat([p[0] for p in parts]), torch.stack([p[1] for p in parts]).sum(0), torch.cat([p[2] for p in parts]))
     v_out = torch.where(mask[..., None], v_out, 0.0)
     used = (degree + 1) ** 2
     kept = torch.where(mask.any(0)[:, None, None], coeffs[:, :used], 0.0).nan_to_num(0.0, 0.0, 0.0)     # 0 v_out, not NaN

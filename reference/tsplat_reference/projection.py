@@ -84,8 +84,9 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
         antialiased: whether to compute compensations.
     """
     if means.shape[0] > CHUNK and not torch.is_grad_enabled():
-        parts = map_chunks(lambda rows: project(*_rows(rows, means, quats, scales, covars, opacities), viewmats, Ks, width, height, model,
-                                                near, far, eps2d, antialiased), means.shape[0], CHUNK)
+        parts = map_chunks(lambda rows: project(
+            means[rows], _at(quats, rows), _at(scales, rows), _at(covars, rows), opacities[rows], viewmats, Ks, width, height, model, near,
+            far, eps2d, antialiased), means.shape[0], CHUNK)
         return Projection(*(torch.cat(p, 1) for p in zip(*parts, strict=True)))
     sane, means, quats, scales, covars = _sanitise(means, quats, scales, covars, opacities)
     W = _rotation(viewmats)
@@ -124,17 +125,17 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
                      v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor) -> ProjectionGradients:
     """Closed-form gradients of `project`, of which `radii` says what was culled."""
     if means.shape[0] > CHUNK:
-        per_view = (radii, v_means2d, v_depths, v_conics, v_compensations)
-        parts = map_chunks(lambda rows: project_backward(*_rows(rows, means, quats, scales, covars), viewmats, Ks, width, height, model, eps2d,
-                                                         antialiased, *(v[:, rows] for v in per_view)), means.shape[0], CHUNK)
-        *per_splat, view_parts, K_parts = zip(*parts, strict=True)
-        joined = [None if p[0] is None else torch.cat(p) for p in per_splat]
-        return ProjectionGradients(*joined, torch.stack(view_parts).sum(0), torch.stack(K_parts).sum(0))
+        parts = map_chunks(lambda rows: project_backward(
+            means[rows], _at(quats, rows), _at(scales, rows), _at(covars, rows), viewmats, Ks, width, height, model, eps2d, antialiased,
+            radii[:, rows], v_means2d[:, rows], v_depths[:, rows], v_conics[:, rows], v_compensations[:, rows]), means.shape[0], CHUNK)
+        return ProjectionGradients(torch.cat([p.means for p in parts]), _cat([p.quats for p in parts]), _cat([p.scales for p in parts]),
+                                   _cat([p.covars for p in parts]), torch.stack([p.viewmats for p in parts]).sum(0),
+                                   torch.stack([p.Ks for p in parts]).sum(0))
     valid = (radii > 0).all(-1)                                                             # [C, N]
     means, quats, scales, covars = _replace(valid.any(0), means, quats, scales, covars)
-    mean, W = split(means), _rotation(viewmats)
+    W = _rotation(viewmats)
     S = _world_covariance(quats, scales, covars)
-    p = _or_ahead(valid, _to_camera(mean, W, viewmats))
+    p = _or_ahead(valid, _to_camera(split(means), W, viewmats))
     intrinsics = split_intrinsics(Ks)
     _, _, J = project_points(p, intrinsics, width, height, model)
     M = matmul(J, W)
@@ -160,15 +161,15 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
     v_W = matmul(transpose(J), v_M)
     v_u, v_v = (torch.where(valid, v, 0.0) for v in v_means2d.unbind(-1))
     v_p, v_Ks = project_points_backward(p, intrinsics, width, height, model, v_u, v_v, matmul(v_M, transpose(W)))
-    v_p = [torch.where(valid, v, 0.0) for v in (*v_p[:2], v_p[2] + v_depths)]
+    v_x, v_y, v_z = (torch.where(valid, v, 0.0) for v in (*v_p[:2], v_p[2] + v_depths))
 
     # p = W mean + t
     v_viewmats = torch.zeros_like(viewmats)
-    for i in range(3):
+    for i, v in enumerate((v_x, v_y, v_z)):
         for j in range(3):
-            v_viewmats[:, i, j] = total(v_W[i][j], det) + (v_p[i] @ mean[j])
-        v_viewmats[:, i, 3] = v_p[i].sum(1)
-    v_means = join([torch.as_tensor(dot(column, v_p)).sum(0) for column in transpose(W)], means[:, 0])
+            v_viewmats[:, i, j] = total(v_W[i][j], det) + v @ means[:, j]
+        v_viewmats[:, i, 3] = v.sum(1)
+    v_means = join([torch.as_tensor(dot(column, (v_x, v_y, v_z))).sum(0) for column in transpose(W)], means[:, 0])
     if covars is not None:
         return ProjectionGradients(v_means, None, None, torch.stack([join(row, means[:, 0]) for row in v_S], -2), v_viewmats, v_Ks)
     quats, scales = _given(quats, scales)
@@ -182,8 +183,13 @@ def _given(quats: Tensor | None, scales: Tensor | None) -> tuple[Tensor, Tensor]
     return quats, scales
 
 
-def _rows(rows: slice, *tensors: Tensor | None) -> tuple[Tensor | None, ...]:
-    return tuple(None if t is None else t[rows] for t in tensors)
+def _at(tensor: Tensor | None, rows: slice) -> Tensor | None:
+    return None if tensor is None else tensor[rows]
+
+
+def _cat(parts: list[Tensor | None]) -> Tensor | None:
+    present = [p for p in parts if p is not None]
+    return torch.cat(present) if present else None
 
 
 def _replace(keep: Tensor, means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None

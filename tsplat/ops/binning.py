@@ -20,7 +20,7 @@ def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor
 @custom_op("tsplat::bin_splats", mutates_args=())
 def bin_splats_op(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
                   ) -> tuple[Tensor, Tensor]:
-    """ids and offsets."""
+    """Ids and offsets."""
     no_kernel("bin_splats", means2d)
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 import tsplat_reference as reference
 from torch import Tensor
 from torch.library import custom_op
@@ -21,13 +20,14 @@ def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ba
     `absgrad` `[C, N, 2]` changes nothing in the result; as its gradient it receives the sum over pixels of |dL/dmeans2d|.
     """
     reject_forward_mode("blend", means2d, conics, opacities, colors, backgrounds)
-    return blend_op(means2d, conics, opacities, colors, backgrounds, absgrad, ids, offsets, width, height, tile, alpha_max)
+    image, alphas = blend_op(means2d, conics, opacities, colors, backgrounds, absgrad, ids, offsets, width, height, tile, alpha_max)
+    return image, alphas
 
 
 @custom_op("tsplat::blend", mutates_args=())
 def blend_op(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None,
              ids: Tensor, offsets: Tensor, width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
-    """image and alpha."""
+    """Image and alpha."""
     no_kernel("blend", means2d)
 
 
@@ -85,11 +85,11 @@ def _save_backward(ctx: Any, inputs: tuple[Any, ...], output: Six) -> None:
 def _double_backward(ctx: Any, *v_gradients: Tensor) -> tuple[Any, ...]:
     means2d, conics, opacities, colors, backgrounds, ids, offsets, v_image, v_alphas = ctx.saved_tensors
 
-    def forward(*inputs: Any) -> tuple[Tensor, Tensor]:
-        return reference.blend(*inputs, ids, offsets, *ctx.options)
+    def forward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None) -> tuple[Tensor, Tensor]:
+        return reference.blend(means2d, conics, opacities, colors, backgrounds, ids, offsets, *ctx.options)
 
-    inputs = means2d, conics, opacities, colors, backgrounds
-    v_inputs, v_cotangents = second_derivative(forward, inputs, (v_image, v_alphas), v_gradients[:5])
+    v_inputs, v_cotangents = second_derivative(forward, (means2d, conics, opacities, colors, backgrounds), (v_image, v_alphas),
+                                               v_gradients[:5])
     return *v_inputs, *[None] * 4, *v_cotangents, *[None] * 5
 
 

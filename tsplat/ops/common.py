@@ -7,8 +7,8 @@ from typing import Any, NoReturn
 
 import torch
 from torch import Tensor
+from torch._library.custom_ops import CustomOpDef
 from torch.autograd import forward_ad
-from torch.library import CustomOpDef
 
 
 def no_kernel(name: str, tensor: Tensor) -> NoReturn:
@@ -22,7 +22,7 @@ def reject_forward_mode(name: str, *tensors: Tensor | None) -> None:
     if torch.compiler.is_compiling():
         return
     for tensor in tensors:
-        if tensor is not None and forward_ad.unpack_dual(tensor).tangent is not None:
+        if tensor is not None and forward_ad.unpack_dual(tensor).tangent is not None:  # type: ignore[no-untyped-call]
             raise NotImplementedError(f"tsplat: {name} has no forward-mode derivative (jvp); use reverse mode, or torch.func.vjp")
 
 
@@ -34,7 +34,7 @@ def register_autocast(*ops: CustomOpDef) -> None:
 
 
 def register_loop_vmap(*ops: CustomOpDef) -> None:
-    """vmap as a loop. (The ops have a camera dimension of their own, which is faster.)"""
+    """Vmap as a loop. (The ops have a camera dimension of their own, which is faster.)"""
     for op in ops:
         op.register_vmap(_looped(op))
 

@@ -17,7 +17,8 @@ Three = tuple[Tensor, Tensor, Tensor]
 def harmonics(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:
     """`tsplat_reference.harmonics` as an op, with gradients to means, centers and coeffs."""
     reject_forward_mode("harmonics", means, centers, coeffs)
-    return harmonics_op(means, centers, coeffs, degree, mask)
+    out: Tensor = harmonics_op(means, centers, coeffs, degree, mask)
+    return out
 
 
 @custom_op("tsplat::harmonics", mutates_args=())

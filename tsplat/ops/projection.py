@@ -20,7 +20,8 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
             Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float, antialiased: bool) -> Projection:
     """`tsplat_reference.project` as an op, with gradients to means, quats, scales, covars, viewmats and Ks."""
     reject_forward_mode("project", means, quats, scales, covars, opacities, viewmats, Ks)
-    return Projection(*project_op(means, quats, scales, covars, opacities, viewmats, Ks, width, height, model, near, far, eps2d, antialiased))
+    return Projection(*project_op(means, quats, scales, covars, opacities, viewmats, Ks, width, height, model, near, far, eps2d,
+                                  antialiased))
 
 
 @custom_op("tsplat::project", mutates_args=())
@@ -41,7 +42,8 @@ def project_backward_op(means: Tensor, quats: Tensor | None, scales: Tensor | No
 
 @project_op.register_kernel("cpu")
 def _project_cpu(*args: Any) -> Five:
-    return tuple(reference.project(*args))
+    radii, means2d, depths, conics, compensations = reference.project(*args)
+    return radii, means2d, depths, conics, compensations
 
 
 @project_backward_op.register_kernel("cpu")

@@ -1,0 +1,136 @@
+"""Speed and memory of `tsplat.rasterize` on a CPU, as a ratio that can be compared between machines.
+
+    python bench/cpu.py               # the table of all scenes, how time grows, and the memory of 1M splats at 1920x1080
+    python bench/cpu.py --quick       # two rows
+
+Each row gives forward and forward+backward in ms (median of 5, float32; backward to means, scales, quats, colours and opacities), blended
+pairs per second over `torch.exp` per second, measured in cache, before and after, in the same process and with the same threads, and the
+time of the best C++ rival (OpenSplat 2026, 2 threads) scaled by the exp rates of its machine (3.4 G/s) and of this one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import torch
+from scenes import Scene, count_pairs, random_scene
+
+import tsplat
+
+RIVAL_EXP_RATE = 3.4e9
+RIVAL_MS = {(256, 256, 1_000): (7, 11), (256, 256, 10_000): (31, 54), (512, 512, 10_000): (41, 83), (256, 256, 100_000): (110, 201),
+            (512, 512, 100_000): (390, 560), (1280, 720, 100_000): (710, 958), (512, 512, 500_000): (821, 1141),
+            (1280, 720, 500_000): (2382, 3458)}
+QUICK = [(256, 256, 10_000), (512, 512, 100_000)]
+LARGE = 1_000_000, 1920, 1080
+
+
+def exp_rate() -> float:
+    """`torch.exp` per second on arguments that stay in the cache."""
+    x = torch.rand(1 << 16) - 5
+    out = torch.empty_like(x)
+    return x.numel() / median_seconds(lambda: [torch.exp(x, out=out) for _ in range(50)], 9) * 50
+
+
+def median_seconds(run: Callable[[], object], times: int) -> float:
+    run()
+    samples = []
+    for _ in range(times):
+        start = time.perf_counter()
+        run()
+        samples.append(time.perf_counter() - start)
+    return statistics.median(samples)
+
+
+def forward(scene: Scene) -> None:
+    with torch.no_grad():
+        tsplat.rasterize(*scene[:5], scene.camera, background=scene.background)
+
+
+def forward_backward(scene: Scene, v_image: torch.Tensor) -> None:
+    leaves = [x.requires_grad_() for x in scene[:5]]
+    image = tsplat.rasterize(*leaves, scene.camera, background=scene.background).image
+    torch.autograd.grad(image, leaves, v_image)
+
+
+def measure(width: int, height: int, n: int, times: int = 5) -> dict[str, float]:
+    scene = random_scene(n, width, height)
+    v_image = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(0))
+    before = exp_rate()
+    ms = [1e3 * median_seconds(run, times) for run in (lambda: forward(scene), lambda: forward_backward(scene, v_image))]
+    rate = (before + exp_rate()) / 2
+    return {"width": width, "height": height, "n": n, "forward_ms": ms[0], "both_ms": ms[1], "exp_rate": rate}
+
+
+def table(rows: list[tuple[int, int, int]]) -> list[dict[str, float]]:
+    print("| size | splats | pairs (M) | fwd ms | fwd+bwd ms | fwd M pairs/s | fwd+bwd | fwd pairs/exp | fwd+bwd | rival's ms | ratio |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+    results = []
+    for width, height, n in rows:
+        row = measure(width, height, n)
+        pairs = row["pairs"] = count_pairs(random_scene(n, width, height))
+        f, b, scale = row["forward_ms"], row["both_ms"], RIVAL_EXP_RATE / row["exp_rate"]
+        rival = [ms * scale for ms in RIVAL_MS[width, height, n]]
+        print(f"| {width}x{height} | {n:,} | {pairs / 1e6:.2f} | {f:.0f} | {b:.0f} | {pairs / f / 1e3:.0f} | {pairs / b / 1e3:.0f} | "
+              f"{pairs / f * 1e3 / row['exp_rate']:.4f} | {pairs / b * 1e3 / row['exp_rate']:.4f} | {rival[0]:.0f} / {rival[1]:.0f} | "
+              f"{f / rival[0]:.2f} / {b / rival[1]:.2f} |", flush=True)
+        results.append(row)
+    return results
+
+
+def growth() -> list[dict[str, float]]:
+    """How time grows with splats (at 512x512) and with pixels (at 100k splats)."""
+    print("\n| size | splats | fwd ms | fwd+bwd ms |\n| --- | --- | --- | --- |")
+    results = []
+    sizes = [(512, 512, n) for n in (1_000, 10_000, 100_000, 1_000_000)] + [(w, h, 100_000) for w, h in (
+        (128, 128), (256, 256), (1024, 1024), (1920, 1080), (3840, 2160))]
+    for size in sizes:
+        row = measure(*size, times=3)
+        print(f"| {size[0]}x{size[1]} | {size[2]:,} | {row['forward_ms']:.0f} | {row['both_ms']:.0f} |", flush=True)
+        results.append(row)
+    return results
+
+
+def large() -> None:
+    """Forward and backward of 1M splats at 1920x1080: the peak memory of a process that does nothing else."""
+    n, width, height = LARGE
+    baseline = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    scene = random_scene(n, width, height)
+    start = time.perf_counter()
+    forward_backward(scene, torch.ones(height, width, 3))
+    seconds, peak = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    print(f"\n{n:,} splats at {width}x{height}, forward+backward: {seconds:.1f} s, peak memory of the process {peak / 2**20:.2f} GiB "
+          f"({baseline / 2**20:.2f} GiB of it before the first call)", flush=True)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="two rows only")
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--large-only", action="store_true", help="only the memory of 1M splats (run in a fresh process)")
+    parser.add_argument("--json", type=Path, help="also write the results here")
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    if args.large_only:
+        large()
+        return
+    print(f"torch {torch.__version__}, {args.threads} threads, {platform.machine()}, exp {exp_rate() / 1e9:.2f} G/s\n")
+    results = {"torch": torch.__version__, "threads": args.threads, "rows": table(QUICK if args.quick else list(RIVAL_MS))}
+    if not args.quick:
+        results["growth"] = growth()
+        subprocess.run([sys.executable, __file__, "--large-only", "--threads", str(args.threads)], check=True)
+    if args.json:
+        args.json.write_text(json.dumps(results, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

@@ -32,7 +32,8 @@ class Camera:
         near, far: splats whose depth (camera z) is outside `(near, far)` are culled.
 
     Raises:
-        ValueError, TypeError: naming the argument, what came and what is expected; also for non-finite matrices.
+        ValueError, TypeError: naming the argument, what came and what is expected; also for matrices that are not finite (not checked on
+            a GPU, for which Python would have to wait, or while compiling).
     """
 
     viewmats: Tensor
@@ -55,6 +56,10 @@ class Camera:
         if self.viewmats.ndim not in (2, 3) or self.viewmats.shape[:-2] != self.Ks.shape[:-2]:
             raise ValueError("camera.viewmats, camera.Ks: expected [C, 4, 4] and [C, 3, 3], or [4, 4] and [3, 3]; "
                              f"got {list(self.viewmats.shape)} and {list(self.Ks.shape)}")
+        if self.viewmats.device.type == "cpu" and not torch.compiler.is_compiling():
+            for name, matrices in (("camera.viewmats", self.viewmats), ("camera.Ks", self.Ks)):
+                if not bool(matrices.isfinite().all()):
+                    raise ValueError(f"{name}: expected finite numbers; got NaN or infinity in {matrices.tolist()}")
 
     @property
     def batched(self) -> bool:

@@ -7,11 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tsplat_reference.constants import ALPHA_MIN, EXTENT_MAX
-
-SLACK = 1e-3
-"""Added, with its relative twin, to the squared radius of the ellipse: rounding may add a hit, but never lose one."""
-SLACK_RELATIVE = 1e-4
+from tsplat_reference.constants import ALPHA_MIN, BIN_SLACK, BIN_SLACK_RELATIVE, EXTENT_MAX
 
 
 class Bins(NamedTuple):
@@ -44,7 +40,7 @@ def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor
     mx, my = means2d.reshape(-1, 2)[visible].unbind(-1)
     a, b, c = conics.reshape(-1, 3)[visible].unbind(-1)
     log_ratio = torch.log(opacities.flatten()[visible].clamp_min(ALPHA_MIN) / ALPHA_MIN)
-    level = (2 * log_ratio).clamp_max(EXTENT_MAX**2) * (1 + SLACK_RELATIVE) + SLACK         # a dx^2 + 2 b dx dy + c dy^2 <= level
+    level = (2 * log_ratio).clamp_max(EXTENT_MAX**2) * (1 + BIN_SLACK_RELATIVE) + BIN_SLACK         # a dx^2 + 2 b dx dy + c dy^2 <= level
     det = torch.maximum(a * c - b * b, torch.finfo(a.dtype).eps * a * c)                    # rounding must not shrink it to 0
 
     half_height = (level * a / det).sqrt()

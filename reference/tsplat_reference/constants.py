@@ -15,6 +15,10 @@ EPS2D = 0.3
 EXTENT_MAX = 3.33
 """Extent of a splat in standard deviations at the most: sqrt(2 ln 255), where an opaque splat falls to ALPHA_MIN."""
 
+BIN_SLACK = 1e-3
+"""Added, with its relative twin, to the squared radius of the ellipse in tile tests: rounding may add a hit, but never lose one."""
+BIN_SLACK_RELATIVE = 1e-4
+
 FRUSTUM_MARGIN = 0.3
 """x/z and y/z in the pinhole Jacobian are clamped to the frustum widened by this part of its half size."""
 

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from tsplat_reference.parallel import map_chunks
+from tsplat_reference.planes import split
 
 MAX_DEGREE = 4
 CHUNK = 1 << 14
@@ -73,9 +74,9 @@ def harmonics(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask:
     if means.shape[0] > CHUNK and not torch.is_grad_enabled():
         return torch.cat(map_chunks(lambda rows: harmonics(means[rows], centers, coeffs[rows], degree, mask[:, rows]),
                                     means.shape[0], CHUNK), 1)
-    coeffs = torch.where(mask.any(0)[:, None, None], coeffs[:, :(degree + 1) ** 2], 0.0)
     unit, _ = _directions(means, centers, mask)
-    return torch.where(mask[..., None], torch.einsum("cnk,nkd->cnd", _evaluate(unit, degree), coeffs), 0.0)
+    basis = _monomials(unit, degree) @ _table(degree, unit.dtype, unit.device)[0]           # [C, N, K]
+    return torch.where(mask[..., None], torch.einsum("cnk,nkd->cnd", basis, coeffs[:, :(degree + 1) ** 2]), 0.0)
 
 
 def harmonics_backward(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor, v_out: Tensor
@@ -87,16 +88,15 @@ def harmonics_backward(means: Tensor, centers: Tensor, coeffs: Tensor, degree: i
         return (torch.cat([p[0] for p in parts]), torch.stack([p[1] for p in parts]).sum(0), torch.cat([p[2] for p in parts]))
     v_out = torch.where(mask[..., None], v_out, 0.0)
     used = (degree + 1) ** 2
-    kept = torch.where(mask.any(0)[:, None, None], coeffs[:, :used], 0.0).nan_to_num(0.0, 0.0, 0.0)     # 0 v_out, not NaN
     unit, length = _directions(means, centers, mask)
+    tables = _table(degree, unit.dtype, unit.device)
+    basis, *slopes = (_monomials(unit, degree) @ tables.movedim(0, 1).flatten(1)).split(used, -1)  # type: ignore[no-untyped-call]
     v_coeffs = torch.zeros_like(coeffs)
-    v_coeffs[:, :used] = torch.einsum("cnk,cnd->nkd", _evaluate(unit, degree), v_out)
-    if degree == 0:
-        return torch.zeros_like(means), torch.zeros_like(centers), v_coeffs
-    v_basis = torch.einsum("cnd,nkd->cnk", v_out, kept)                                     # [C, N, K]
-    v_unit = torch.stack([(_evaluate(unit, degree, axis) * v_basis).sum(-1) for axis in range(3)], -1)
+    v_coeffs[:, :used] = torch.einsum("cnk,cnd->nkd", basis, v_out)
+    v_basis = torch.einsum("cnd,nkd->cnk", v_out, coeffs[:, :used])
+    v_unit = torch.stack([(slope * v_basis).sum(-1) for slope in slopes], -1)
     v_dirs = (v_unit - unit * (unit * v_unit).sum(-1, keepdim=True)) / length
-    v_dirs = torch.where(mask[..., None], v_dirs, 0.0)
+    v_dirs = torch.where((v_out != 0).any(-1, keepdim=True), v_dirs, 0.0)                   # 0 also where the coefficients are NaN
     return v_dirs.sum(0), -v_dirs.sum(1), v_coeffs
 
 
@@ -109,32 +109,34 @@ def _directions(means: Tensor, centers: Tensor, mask: Tensor) -> tuple[Tensor, T
     return dirs / length, torch.where(nowhere, math.inf, length)
 
 
-def _evaluate(unit: Tensor, degree: int, derivative: int | None = None) -> Tensor:
-    """The basis `[..., (degree + 1)^2]` at unit directions `[..., 3]`, or its derivative along one axis."""
-    powers = [torch.ones_like(unit)]                                                        # 1, d, d^2, ... [..., 3]
-    for _ in range(degree):
-        powers.append(powers[-1] * unit)
-    exponents = _monomials(degree)
-    columns = [powers[i][..., 0] * powers[j][..., 1] * powers[k][..., 2] for i, j, k in exponents]
-    return torch.stack(columns, -1) @ _table(degree, derivative, unit.dtype, unit.device)
-
-
-def _monomials(degree: int) -> list[tuple[int, int, int]]:
+def _exponents(degree: int) -> list[tuple[int, int, int]]:
+    """Of all monomials up to the degree; each after the one that it is a multiple of."""
     n = degree + 1
     return [(i, j, k) for i in range(n) for j in range(n) for k in range(n) if i + j + k <= degree]
 
 
+def _monomials(unit: Tensor, degree: int) -> Tensor:
+    """All monomials `[..., M]` at unit directions `[..., 3]`, stored as planes."""
+    axes = split(unit)
+    planes = {(0, 0, 0): torch.ones_like(unit[..., 0])}
+    for e in _exponents(degree)[1:]:
+        axis = next(a for a in range(3) if e[a])
+        planes[e] = planes[e[0] - (axis == 0), e[1] - (axis == 1), e[2] - (axis == 2)] * axes[axis]
+    return torch.stack(list(planes.values())).movedim(0, -1)
+
+
 @functools.cache
-def _table(degree: int, derivative: int | None, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`[monomials, (degree + 1)^2]`."""
-    row = {exponents: i for i, exponents in enumerate(_monomials(degree))}
-    table = torch.zeros(len(row), (degree + 1) ** 2, dtype=torch.float64)
+def _table(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """`[4, M, (degree + 1)^2]`: the basis, and its derivatives along x, y and z, over the monomials."""
+    row = {e: i for i, e in enumerate(_exponents(degree))}
+    with torch.inference_mode(False):                       # it stays, and autograd cannot save what was made in inference mode
+        table = torch.zeros(4, len(row), (degree + 1) ** 2, dtype=torch.float64)
     for column, (constant, polynomial) in enumerate(_BASIS[:(degree + 1) ** 2]):
-        for exponents, factor in polynomial.items():
-            e = list(exponents)
-            scale = constant * factor
-            if derivative is not None:
-                scale *= e[derivative]
-                e[derivative] = max(e[derivative] - 1, 0)
-            table[row[e[0], e[1], e[2]], column] += scale
-    return table.to(dtype=dtype, device=device)
+        for e, factor in polynomial.items():
+            table[0, row[e], column] += constant * factor
+            for axis in range(3):
+                if e[axis]:
+                    lower = e[0] - (axis == 0), e[1] - (axis == 1), e[2] - (axis == 2)
+                    table[1 + axis, row[lower], column] += constant * factor * e[axis]
+    with torch.inference_mode(False):
+        return table.to(dtype=dtype, device=device, copy=True)

@@ -41,7 +41,7 @@ def gram(a: Matrix) -> list[list[Plane]]:
     return [[upper[min(i, j), max(i, j)] for j in range(len(a))] for i in range(len(a))]
 
 
-def split(tensor: Tensor) -> list[Plane]:
+def split(tensor: Tensor) -> list[Tensor]:
     """The planes `[...]` of a tensor `[..., D]`, each contiguous."""
     return list(tensor.movedim(-1, 0).contiguous().unbind(0))
 

@@ -1,4 +1,4 @@
-"""Tile intersection and depth order as a custom op: CPU tensors run the reference. Not differentiable."""
+"""Tile intersection and depth order as a custom op: CPU tensors run the reference, others the Triton kernels. Not differentiable."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from torch import Tensor
 from torch.library import custom_op
 from tsplat_reference import Bins
 
-from tsplat.ops.common import no_kernel, register_autocast
+from tsplat.ops.common import register_autocast, run_kernel
 
 
 def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
@@ -21,7 +21,8 @@ def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor
 def bin_splats_op(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
                   ) -> tuple[Tensor, Tensor]:
     """Ids and offsets."""
-    no_kernel("bin_splats", means2d)
+    ids, offsets = run_kernel("binning", "bin_splats", means2d, means2d, radii, conics, opacities, depths, width, height, tile)
+    return ids, offsets
 
 
 @bin_splats_op.register_kernel("cpu")

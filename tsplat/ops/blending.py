@@ -1,4 +1,4 @@
-"""Blending as a custom op: CPU tensors run the reference, in blocks."""
+"""Blending as a custom op: CPU tensors run the reference, in blocks, others the Triton kernels."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import tsplat_reference as reference
 from torch import Tensor
 from torch.library import custom_op
 
-from tsplat.ops.common import no_kernel, register_autocast, reject_forward_mode, second_derivative
+from tsplat.ops.common import register_autocast, reject_forward_mode, run_kernel, second_derivative
 
 Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
@@ -28,7 +28,9 @@ def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ba
 def blend_op(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None,
              ids: Tensor, offsets: Tensor, width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
     """Image and alpha."""
-    no_kernel("blend", means2d)
+    image, alphas = run_kernel("blending", "blend", means2d, means2d, conics, opacities, colors, backgrounds, ids, offsets, width, height,
+                               tile, alpha_max)
+    return image, alphas
 
 
 @custom_op("tsplat::blend_backward", mutates_args=())
@@ -36,7 +38,10 @@ def blend_backward_op(means2d: Tensor, conics: Tensor, opacities: Tensor, colors
                       offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int,
                       tile: int, alpha_max: float, absgrad: bool) -> Six:
     """Gradients of means2d, conics, opacities, colors and backgrounds, and the absolute gradient, `[C, 0, 2]` unless asked for."""
-    no_kernel("blend_backward", means2d)
+    v_means2d, v_conics, v_opacities, v_colors, v_backgrounds, v_abs = run_kernel(
+        "blending", "blend_backward", means2d, means2d, conics, opacities, colors, backgrounds, ids, offsets, image, alphas, v_image,
+        v_alphas, width, height, tile, alpha_max, absgrad)
+    return v_means2d, v_conics, v_opacities, v_colors, v_backgrounds, v_abs
 
 
 @blend_op.register_kernel("cpu")

@@ -1,9 +1,11 @@
-"""What all ops share: the answer where there is no kernel, forward mode, autocast, vmap, and the second derivative."""
+"""What all ops share: reaching the Triton kernels, forward mode, autocast, vmap, and the second derivative."""
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,10 +13,21 @@ from torch._library.custom_ops import CustomOpDef
 from torch.autograd import forward_ad
 
 
-def no_kernel(name: str, tensor: Tensor) -> NoReturn:
-    """Raise for a device that the op `name` has no kernel for."""
-    raise NotImplementedError(f"tsplat: {name} has no kernel for device {str(tensor.device)!r} yet; move the tensors to the CPU: "
-                              ".to('cpu')")
+def run_kernel(stage: str, name: str, tensor: Tensor, *args: Any) -> Any:
+    """Call the launcher `name` of `tsplat.kernels.<stage>` on the device of `tensor`: Triton launches on the current one.
+
+    Raises:
+        NotImplementedError: where Triton is not installed (macOS, Windows).
+    """
+    try:
+        kernels = importlib.import_module(f"tsplat.kernels.{stage}")
+    except ModuleNotFoundError as error:
+        if error.name is None or not error.name.startswith("triton"):
+            raise
+        raise NotImplementedError(f"tsplat: {name} on device {str(tensor.device)!r} needs Triton, which is not installed here; "
+                                  "install it, or move the tensors to the CPU: .to('cpu')") from None
+    with torch.cuda.device(tensor.device) if tensor.is_cuda else contextlib.nullcontext():
+        return getattr(kernels, name)(*args)
 
 
 def reject_forward_mode(name: str, *tensors: Tensor | None) -> None:

@@ -1,4 +1,4 @@
-"""Spherical harmonics as a custom op: CPU tensors run the reference."""
+"""Spherical harmonics as a custom op: CPU tensors run the reference, others the Triton kernels."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import tsplat_reference as reference
 from torch import Tensor
 from torch.library import custom_op
 
-from tsplat.ops.common import no_kernel, register_autocast, register_loop_vmap, reject_forward_mode, second_derivative
+from tsplat.ops.common import register_autocast, register_loop_vmap, reject_forward_mode, run_kernel, second_derivative
 
 Three = tuple[Tensor, Tensor, Tensor]
 
@@ -24,13 +24,15 @@ def harmonics(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask:
 @custom_op("tsplat::harmonics", mutates_args=())
 def harmonics_op(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:
     """`[C, N, D]`."""
-    no_kernel("harmonics", means)
+    out: Tensor = run_kernel("harmonics", "harmonics", means, means, centers, coeffs, degree, mask)
+    return out
 
 
 @custom_op("tsplat::harmonics_backward", mutates_args=())
 def harmonics_backward_op(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor, v_out: Tensor) -> Three:
     """Gradients of means, centers and coeffs."""
-    no_kernel("harmonics_backward", means)
+    v_means, v_centers, v_coeffs = run_kernel("harmonics", "harmonics_backward", means, means, centers, coeffs, degree, mask, v_out)
+    return v_means, v_centers, v_coeffs
 
 
 harmonics_op.register_kernel("cpu")(reference.harmonics)
@@ -67,7 +69,8 @@ def _double_backward(ctx: Any, *v_gradients: Tensor) -> tuple[Any, ...]:
     means, centers, coeffs, mask, v_out = ctx.saved_tensors
 
     def forward(means: Tensor, centers: Tensor, coeffs: Tensor) -> list[Tensor]:
-        return [reference.harmonics(means, centers, coeffs, ctx.degree, mask)]
+        finite = torch.where(coeffs.isfinite(), coeffs, 0.0)        # the colour of the others is not drawn: their gradient is 0, not NaN
+        return [reference.harmonics(means, centers, finite, ctx.degree, mask)]
 
     v_inputs, (v_v_out,) = second_derivative(forward, (means, centers, coeffs), (v_out,), v_gradients)
     return *v_inputs, None, None, v_v_out

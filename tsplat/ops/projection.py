@@ -1,4 +1,4 @@
-"""Projection of Gaussians to 2D splats as a custom op: CPU tensors run the reference."""
+"""Projection of Gaussians to 2D splats as a custom op: CPU tensors run the reference, others the Triton kernels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.library import custom_op
 from tsplat_reference import Projection
 
-from tsplat.ops.common import no_kernel, register_autocast, register_loop_vmap, reject_forward_mode, second_derivative
+from tsplat.ops.common import register_autocast, register_loop_vmap, reject_forward_mode, run_kernel, second_derivative
 
 Five = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -28,7 +28,10 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
 def project_op(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor, viewmats: Tensor,
                Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float, antialiased: bool) -> Five:
     """radii, means2d, depths, conics, compensations."""
-    no_kernel("project", means)
+    radii, means2d, depths, conics, compensations = run_kernel(
+        "projection", "project", means, means, quats, scales, covars, opacities, viewmats, Ks, width, height, model, near, far, eps2d,
+        antialiased)
+    return radii, means2d, depths, conics, compensations
 
 
 @custom_op("tsplat::project_backward", mutates_args=())
@@ -37,7 +40,9 @@ def project_backward_op(means: Tensor, quats: Tensor | None, scales: Tensor | No
                         antialiased: bool, radii: Tensor, v_means2d: Tensor, v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor
                         ) -> Six:
     """Gradients of means, quats, scales, covars, viewmats and Ks, empty for those that are None."""
-    no_kernel("project_backward", means)
+    return _some_empty(means, run_kernel(
+        "projection", "project_backward", means, means, quats, scales, covars, viewmats, Ks, width, height, model, eps2d, antialiased,
+        radii, v_means2d, v_depths, v_conics, v_compensations))
 
 
 @project_op.register_kernel("cpu")
@@ -50,7 +55,12 @@ def _project_cpu(*args: Any) -> Five:
 def _project_backward_cpu(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
                           viewmats: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float,
                           antialiased: bool, *gradients: Tensor) -> Six:
-    results = reference.project_backward(means, quats, scales, covars, viewmats, Ks, width, height, model, eps2d, antialiased, *gradients)
+    return _some_empty(means, reference.project_backward(
+        means, quats, scales, covars, viewmats, Ks, width, height, model, eps2d, antialiased, *gradients))
+
+
+def _some_empty(means: Tensor, results: tuple[Tensor | None, ...]) -> Six:
+    """An op returns tensors only."""
     return tuple(means.new_empty(0) if r is None else r for r in results)  # type: ignore[return-value]
 
 
@@ -64,7 +74,8 @@ def _project_fake(means: Tensor, quats: Any, scales: Any, covars: Any, opacities
 @project_backward_op.register_fake
 def _project_backward_fake(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
                            viewmats: Tensor, Ks: Tensor, *_: Any) -> Six:
-    return tuple(means.new_empty(0 if x is None else x.shape) for x in (means, quats, scales, covars, viewmats, Ks))  # type: ignore[return-value]
+    inputs = means, quats, scales, covars, viewmats, Ks
+    return tuple(means.new_empty(0 if x is None else x.shape) for x in inputs)  # type: ignore[return-value]
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: Five) -> None:

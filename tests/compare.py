@@ -1,0 +1,81 @@
+"""How far results are from what they should be."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Callable, Iterator, Sequence
+
+import torch
+from torch import Tensor
+
+
+def error(got: Tensor, want: Tensor) -> float:
+    """Largest difference, in units of the largest wanted magnitude (absolute where all are 0); infinite for NaN."""
+    assert got.shape == want.shape, f"shape {list(got.shape)}, expected {list(want.shape)}"
+    if got.numel() == 0:
+        return 0.0
+    got, want = got.detach().cpu().double(), want.detach().cpu().double()
+    scale = want.abs().max().item()
+    worst = ((got - want).abs().max() / (scale or 1.0)).item()
+    return math.inf if math.isnan(worst) else worst
+
+
+def assert_close(got: Tensor | Sequence[Tensor], want: Tensor | Sequence[Tensor], tolerance: float) -> None:
+    """Each tensor within `tolerance` of the wanted one, as `error` measures it."""
+    if isinstance(got, Tensor) or isinstance(want, Tensor):
+        got, want = [got], [want]
+    errors = [error(g, w) for g, w in zip(got, want, strict=True)]
+    assert max(errors) <= tolerance, f"errors {[f'{e:.1e}' for e in errors]}, allowed {tolerance:.1e}"
+
+
+def assert_same_bits(got: Sequence[Tensor], want: Sequence[Tensor]) -> None:
+    """Equal shapes, dtypes and values."""
+    for i, (g, w) in enumerate(zip(got, want, strict=True)):
+        assert g.dtype == w.dtype, f"{i}: {g.dtype}, expected {w.dtype}"
+        assert torch.equal(g, w), f"{i}: differs by {error(g, w):.1e}"
+
+
+def leaves(*tensors: Tensor) -> list[Tensor]:
+    """Copies that require grad, if they are of floating point."""
+    return [t.detach().clone().requires_grad_(t.is_floating_point()) for t in tensors]
+
+
+def gradients(outputs: Sequence[Tensor], inputs: Sequence[Tensor], seed: int = 0, **options: bool) -> list[Tensor]:
+    """Gradients of the sum of outputs times fixed random weights; zeros where there is none."""
+    outputs = [o for o in outputs if o.is_floating_point()]
+    g = torch.Generator().manual_seed(seed)
+    weights = [torch.randn(o.shape, generator=g, dtype=torch.float64).to(o) for o in outputs]
+    outputs, weights = zip(*[(o, w) for o, w in zip(outputs, weights, strict=True) if o.requires_grad], strict=True)
+    return list(torch.autograd.grad(outputs, inputs, weights, materialize_grads=True, **options))
+
+
+@contextlib.contextmanager
+def threads(count: int) -> Iterator[None]:
+    """So many torch threads for a while."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def strided(tensor: Tensor) -> Tensor:
+    """The same values, with gaps in memory and the dimensions in reverse order."""
+    reverse = list(range(tensor.ndim))[::-1]
+    spaced = tensor.new_full([2 * s for s in reversed(tensor.shape)], math.nan if tensor.is_floating_point() else 0)
+    every_other = spaced[tuple(slice(None, None, 2) for _ in reverse)]
+    every_other.copy_(tensor.permute(reverse))
+    return every_other.permute(reverse)
+
+
+def permuted(tensor: Tensor) -> Tensor:
+    """The same values, dense, with the dimensions in reverse order in memory."""
+    reverse = list(range(tensor.ndim))[::-1]
+    return tensor.permute(reverse).contiguous().permute(reverse)
+
+
+def each(function: Callable[[Tensor], Tensor], arguments: Sequence[object]) -> list[object]:
+    """The arguments with the function applied to tensors."""
+    return [function(a) if isinstance(a, Tensor) else a for a in arguments]

@@ -1,0 +1,92 @@
+"""Losses and metrics against their formulas; masks, alpha, and images smaller than the window."""
+
+import math
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import conv2d
+
+from tsplat.fit.losses import Target, photo_loss, psnr, ssim, ssim_map, target_of
+
+
+def images(height: int, width: int) -> tuple[Tensor, Tensor]:
+    generator = torch.Generator().manual_seed(0)
+    a = torch.rand(height, width, 3, generator=generator)
+    return a, (a + 0.2 * torch.randn(height, width, 3, generator=generator)).clamp(0, 1)
+
+
+def plain_ssim(a: Tensor, b: Tensor) -> Tensor:
+    """By the formula of Wang et al., zero padding, in float64."""
+    g = torch.exp(-torch.arange(-5, 6, dtype=torch.float64).square() / (2 * 1.5**2))
+    window = torch.outer(g, g)[None, None] / g.sum() ** 2
+
+    def blur(x: Tensor) -> Tensor:
+        return conv2d(x.double().permute(2, 0, 1)[:, None], window, padding=5)[:, 0].permute(1, 2, 0)
+
+    mean_a, mean_b = blur(a), blur(b)
+    var_a, var_b, cov = blur(a * a) - mean_a**2, blur(b * b) - mean_b**2, blur(a * b) - mean_a * mean_b
+    c1, c2 = 0.01**2, 0.03**2
+    return (2 * mean_a * mean_b + c1) * (2 * cov + c2) / ((mean_a**2 + mean_b**2 + c1) * (var_a + var_b + c2))
+
+
+@pytest.mark.parametrize("size", [(20, 30), (1, 1), (3, 40), (11, 11)])
+def test_ssim_is_the_formula(size: tuple[int, int]) -> None:
+    a, b = images(*size)
+    torch.testing.assert_close(ssim_map(a, b).double(), plain_ssim(a, b), atol=1e-4, rtol=0)
+    torch.testing.assert_close(ssim_map(a, a), torch.ones(*size, 3), atol=1e-4, rtol=0)
+
+
+def test_loss_is_the_weighted_sum() -> None:
+    a, b = images(16, 20)
+    l1, dissimilarity = float((a - b).abs().mean()), float(1 - plain_ssim(a, b).mean())
+    for weight in (0.0, 0.2, 1.0):
+        expected = (1 - weight) * l1 + weight * dissimilarity
+        assert float(photo_loss(a, Target(b), weight)) == pytest.approx(expected, abs=1e-5)
+
+
+def test_psnr() -> None:
+    a = torch.full((4, 5, 3), 0.5)
+    assert float(psnr(a + 0.1, Target(a))) == pytest.approx(20, abs=1e-4)
+    assert float(psnr(a, Target(a))) == pytest.approx(100)
+
+
+def test_masked_pixels_do_not_count() -> None:
+    a, b = images(24, 24)
+    mask = torch.ones(24, 24, 1)
+    mask[:, :12] = 0
+    photo = torch.cat([b, mask], dim=2)
+    target = target_of(photo, torch.zeros(3), masked=True)
+    spoilt = torch.where(mask.bool(), a, 1 - a)
+    a.requires_grad_()
+    loss = photo_loss(a, target, 0.2)
+    loss.backward()
+    assert a.grad is not None
+    assert (a.grad[:, :12] == 0).all()
+    assert (a.grad[:, 12:] != 0).any()
+    a = a.detach()
+    for measure in (psnr, ssim):
+        assert float(measure(a, target)) == pytest.approx(float(measure(spoilt, target)), abs=1e-5)
+    assert float(psnr(a, target)) == pytest.approx(float(psnr(a[:, 12:], Target(b[:, 12:]))), abs=1e-4)
+    assert float(ssim(a, target)) < float(ssim(b, target)) == pytest.approx(1, abs=1e-4)
+
+
+def test_photo_that_is_masked_altogether() -> None:
+    a, b = images(12, 12)
+    target = Target(b, torch.zeros(12, 12, 1))
+    a.requires_grad_()
+    loss = photo_loss(a, target, 0.2)
+    loss.backward()
+    assert math.isfinite(float(loss.detach()))
+    assert a.grad is not None
+    assert (a.grad == 0).all()
+
+
+def test_alpha_shows_the_background() -> None:
+    _, b = images(8, 8)
+    alpha = torch.rand(8, 8, 1)
+    photo, background = torch.cat([b, alpha], dim=2), torch.tensor([1.0, 0.5, 0.0])
+    target = target_of(photo, background, masked=False)
+    assert target.mask is None
+    torch.testing.assert_close(target.image, b * alpha + background * (1 - alpha))
+    assert torch.equal(target_of(b, background, masked=True).image, b)

@@ -1,0 +1,31 @@
+"""Every kernel compiles for every target without spilling registers, by the launchers that users call, without a GPU."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("triton", reason="Triton is not installed here")
+
+ROOT = Path(__file__).resolve().parents[1]
+TARGETS = ["sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120", "gfx942", "gfx1100"]
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_no_kernel_spills(target: str, tmp_path: Path) -> None:
+    environment = {**os.environ, "TRITON_CACHE_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "reference")])}
+    environment.pop("TRITON_INTERPRET", None)
+    run = subprocess.run([sys.executable, "-W", "ignore", str(ROOT / "bench" / "sass.py"), "--json", "--quick", "--targets", target],
+                         capture_output=True, text=True, env=environment)
+    assert run.returncode == 0, run.stderr
+    kernels = json.loads(run.stdout)
+    names = {k["kernel"] for k in kernels}
+    assert {"blend_fwd_kernel", "blend_bwd_kernel", "feature_fwd_kernel", "feature_bwd_kernel", "count_kernel", "emit_kernel"} <= names
+    assert any("project" in n for n in names)
+    assert any("harmonics" in n for n in names)
+    assert {(k["kernel"], k["label"]): k["spills"] for k in kernels if k["spills"] != 0} == {}

@@ -1,0 +1,153 @@
+"""The Triton kernels of binning and blending, in the interpreter without a GPU, against the reference."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+
+import pytest
+import scenes
+import torch
+import tsplat_reference as reference
+from compare import assert_close
+from torch import Tensor
+
+pytest.importorskip("triton", reason="Triton is not installed here")
+
+from tsplat.kernels import binning, blending
+
+TILE = 16
+ALPHA_MAX = 0.99
+
+
+@dataclasses.dataclass
+class Case:
+    """2D splats with their lists, in the middle of larger buffers full of NaN, so that a read out of bounds shows."""
+
+    splats: scenes.Splats2D
+    bins: reference.Bins
+    width: int
+    height: int
+
+    @property
+    def arguments(self) -> tuple[Tensor | int | float | None, ...]:
+        return *self.splats[:5], *self.bins, self.width, self.height, TILE, ALPHA_MAX
+
+
+def guarded(tensor: Tensor | None) -> Tensor | None:
+    """The same numbers with NaN (or, for indices, numbers far out of range) before and after them in memory."""
+    if tensor is None:
+        return None
+    fill = float("nan") if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max // 2
+    memory = torch.full((tensor.numel() + 128,), fill, dtype=tensor.dtype)
+    inner = memory[64:64 + tensor.numel()].view(tensor.shape)
+    return inner.copy_(tensor)
+
+
+def case(cameras: int, n: int, width: int, height: int, *, dtype: torch.dtype = torch.float64, device: str = "cpu",
+         **options: object) -> Case:
+    s = scenes.splats2d(cameras, n, width, height, **options)  # type: ignore[arg-type]
+    bins = reference.bin_splats(s.means2d, s.radii, s.conics, s.opacities, s.depths, width, height, TILE)
+    put = [None if x is None else guarded(x.to(dtype) if x.is_floating_point() else x).to(device) for x in s]
+    return Case(scenes.Splats2D(*put), reference.Bins(*(guarded(b).to(device) for b in bins)), width, height)
+
+
+@pytest.fixture
+def deterministic() -> Iterator[None]:
+    torch.use_deterministic_algorithms(True)
+    yield
+    torch.use_deterministic_algorithms(False)
+
+
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+CASES = {
+    "one channel": {"cameras": 1, "n": 9, "width": 21, "height": 17, "channels": 1},
+    "RGB, shared colours, no background": {"cameras": 2, "n": 12, "width": 17, "height": 9, "channels": 3, "shared_colors": True,
+                                           "background": False},
+    "four channels": {"cameras": 1, "n": 12, "width": 33, "height": 5, "channels": 4},
+    "matrix products": {"cameras": 2, "n": 14, "width": 19, "height": 18, "channels": 21, "shared_colors": True},
+    "saturated": {"cameras": 1, "n": 60, "width": 16, "height": 10, "channels": 3, "size": (4.0, 9.0), "opacity": (0.6, 0.999)},
+    "saturated, many channels": {"cameras": 1, "n": 60, "width": 10, "height": 16, "channels": 5, "size": (4.0, 9.0),
+                                 "opacity": (0.6, 0.999)},
+    "one pixel": {"cameras": 1, "n": 3, "width": 1, "height": 1, "channels": 3},
+    "no splats": {"cameras": 2, "n": 0, "width": 18, "height": 3, "channels": 3},
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_forward_and_backward_agree_with_the_reference(name: str) -> None:
+    """To 1e-12 of the largest: both evaluate the same formula, with sums in another order."""
+    c = case(**CASES[name], device=DEVICE)
+    cpu = [x.cpu() if isinstance(x, Tensor) else x for x in c.arguments]
+    want = reference.blend_blocks(*cpu)
+    got = blending.blend(*c.arguments)
+    assert_close([g.cpu() for g in got], want, 1e-12)
+    v = [torch.randn_like(w) for w in want]
+    v_want = reference.blend_blocks_backward(*cpu[:7], *want, *v, *cpu[7:], True)
+    v_got = blending.blend_backward(*c.arguments[:7], *(guarded(x).to(DEVICE) for x in (*want, *v)), *c.arguments[7:], True)
+    assert_close([g.cpu() for g in v_got], v_want, 1e-12)
+
+
+@pytest.mark.parametrize("channels", [3, 6])
+def test_deterministic_mode_gives_the_same_gradients_and_the_same_bits(deterministic: None, channels: int) -> None:
+    c = case(1, 15, 30, 18, channels=channels, device=DEVICE)
+    image, alphas = blending.blend(*c.arguments)
+    v = torch.randn_like(image), torch.randn_like(alphas)
+    first, second = (blending.blend_backward(*c.arguments[:7], image, alphas, *v, *c.arguments[7:], False) for _ in range(2))
+    assert all(torch.equal(a, b) for a, b in zip(first, second, strict=True))
+    torch.use_deterministic_algorithms(False)
+    free = blending.blend_backward(*c.arguments[:7], image, alphas, *v, *c.arguments[7:], False)
+    assert_close(first, free, 1e-12)
+
+
+def test_deterministic_absolute_gradients_of_many_channels_raise(deterministic: None) -> None:
+    c = case(1, 4, 8, 8, channels=5, device=DEVICE)
+    image, alphas = blending.blend(*c.arguments)
+    with pytest.raises(NotImplementedError, match="absgrad"):
+        blending.blend_backward(*c.arguments[:7], image, alphas, image, alphas, *c.arguments[7:], True)
+
+
+def test_float32_is_as_close_as_its_rounding() -> None:
+    """60 splats deep: some 100 roundings of 6e-8 per pixel, and as much again in the records."""
+    c = case(1, 60, 20, 20, dtype=torch.float32, device=DEVICE)
+    exact = case(1, 60, 20, 20)
+    assert_close([g.cpu().double() for g in blending.blend(*c.arguments)], reference.blend_blocks(*exact.arguments), 2e-5)
+
+
+def test_another_tile_raises() -> None:
+    c = case(1, 2, 8, 8, device=DEVICE)
+    with pytest.raises(ValueError, match="tile: expected 16"):
+        blending.blend(*c.arguments[:-2], 8, ALPHA_MAX)
+
+
+BINNED = {"batch": (3, 40, 70, 41, {}), "large splats": (1, 10, 100, 37, {"size": (10.0, 40.0)}), "nothing": (1, 0, 20, 20, {}),
+          "invisible": (2, 9, 33, 33, {})}
+
+
+@pytest.mark.parametrize("name", BINNED)
+def test_bins_are_those_of_the_reference(name: str) -> None:
+    cameras, n, width, height, options = BINNED[name]
+    s = scenes.splats2d(cameras, n, width, height, **options)
+    radii = torch.zeros_like(s.radii) if name == "invisible" else s.radii
+    arguments = s.means2d, radii, s.conics, s.opacities, s.depths
+    want = reference.bin_splats(*arguments, width, height, TILE)
+    got = binning.bin_splats(*(guarded(x).to(DEVICE) for x in arguments), width, height, TILE)
+    assert torch.equal(got[0].cpu(), want.ids)
+    assert torch.equal(got[1].cpu(), want.offsets)
+
+
+@pytest.mark.parametrize("spare", [0, 7, -20])
+def test_fixed_capacity_reports_overflow_and_corrupts_nothing(spare: int) -> None:
+    """With room, the same lists; without, a prefix in depth order of each tile's list, and the number that would have been needed."""
+    s = scenes.splats2d(2, 30, 50, 40)
+    arguments = s.means2d, s.radii, s.conics, s.opacities, s.depths
+    want = reference.bin_splats(*arguments, 50, 40, TILE)
+    capacity = len(want.ids) + spare
+    ids, offsets, hits = binning.bin_splats_fixed(*(x.to(DEVICE) for x in arguments), 50, 40, TILE, capacity)
+    assert int(hits) == len(want.ids)
+    assert ids.shape == (capacity,)
+    assert int(offsets[-1]) == min(capacity, len(want.ids))
+    for t in range(len(offsets) - 1):
+        mine, theirs = ids[offsets[t]:offsets[t + 1]].cpu(), want.ids[want.offsets[t]:want.offsets[t + 1]]
+        assert torch.equal(mine, theirs[:len(mine)])
+        assert len(mine) == len(theirs) or spare < 0

@@ -1,0 +1,145 @@
+"""The ops over the Triton kernels: in the interpreter, on CPU tensors with the reference out of the way, or on a GPU where there is one."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import scenes
+import torch
+from compare import assert_close
+from torch import Tensor
+from torch.library import opcheck
+
+import tsplat
+
+pytest.importorskip("triton", reason="Triton is not installed here")
+
+OPS = [getattr(importlib.import_module(f"tsplat.ops.{module}"), name) for module, name in (
+    ("projection", "project_op"), ("projection", "project_backward_op"), ("harmonics", "harmonics_op"),
+    ("harmonics", "harmonics_backward_op"), ("binning", "bin_splats_op"), ("blending", "blend_op"), ("blending", "blend_backward_op"))]
+DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
+WIDTH, HEIGHT = 19, 13
+
+
+@contextlib.contextmanager
+def kernels() -> Iterator[None]:
+    """The ops run Triton, also on CPU tensors."""
+    with contextlib.ExitStack() as stack:
+        for op in OPS:
+            stack.enter_context(op.set_kernel_enabled("cpu", False))
+        yield
+
+
+def render(*inputs: Tensor, width: int = WIDTH, height: int = HEIGHT) -> tuple[Tensor, Tensor, Tensor]:
+    """Everything at once: SH colours, a batch of cameras, background, depth, antialiasing."""
+    means, quats, scales, opacities, sh, viewmats, Ks, background = inputs
+    r = tsplat.rasterize(means, quats, scales, opacities, sh, tsplat.Camera(viewmats, Ks, width, height), sh_degree=2,
+                         background=background, depth="expected", antialiased=True, tile=16)
+    assert r.depth is not None
+    return r.image, r.alpha, r.depth
+
+
+def inputs(n: int = 8, device: str = DEVICE, cameras: int = 2) -> list[Tensor]:
+    s, camera = scenes.splats(n, seed=3), scenes.camera(cameras, WIDTH, HEIGHT)
+    every = *s[:4], scenes.sh_coefficients(n, 2), camera.viewmats, camera.Ks, torch.tensor([0.2, 0.9, 0.5], dtype=torch.float64)
+    return [x.to(device).requires_grad_() for x in every]
+
+
+def values_and_gradients(function: Callable[..., tuple[Tensor, ...]], leaves: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+    outputs = function(*leaves)
+    v = [torch.linspace(-1, 1, x.numel(), dtype=x.dtype, device=x.device).view_as(x) for x in outputs]
+    return [x.detach().cpu() for x in outputs], [g.cpu() for g in torch.autograd.grad(outputs, leaves, v)]
+
+
+def test_images_and_all_gradients_are_those_of_the_reference() -> None:
+    """To 1e-11 of the largest: rounding, divided by a transmittance of 1e-2, and by the alpha of expected depth."""
+    want = values_and_gradients(render, inputs(device="cpu"))
+    with kernels():
+        got = values_and_gradients(render, inputs())
+    assert_close(got[0], want[0], 1e-11)
+    assert_close(got[1], want[1], 1e-11)
+
+
+def test_gradcheck_on_the_kernels_themselves() -> None:
+    with kernels():
+        assert torch.autograd.gradcheck(lambda *x: render(*x, width=9, height=7), inputs(3, cameras=1), fast_mode=True)
+
+
+def test_second_derivatives() -> None:
+    """Through the reference, whatever runs the first."""
+    leaves = inputs(2, cameras=1)
+
+    def image(means: Tensor, opacities: Tensor) -> Tensor:
+        return render(means, *leaves[1:3], opacities, *leaves[4:], width=9, height=7)[0]
+
+    with kernels():
+        assert torch.autograd.gradgradcheck(image, (leaves[0], leaves[3]), fast_mode=True)
+
+
+def test_strided_upstream_gradients() -> None:
+    leaves = inputs()
+    reference = inputs(device="cpu")
+    want = torch.autograd.grad(render(*reference)[0].sum(), reference)
+    with kernels():
+        got = torch.autograd.grad(render(*leaves)[0].sum(), leaves)
+    assert_close([g.cpu() for g in got], want, 1e-11)
+
+
+@pytest.mark.parametrize("dynamic", [False, True])
+def test_compiles_whole(dynamic: bool) -> None:
+    compiled = torch.compile(render, fullgraph=True, dynamic=dynamic, backend="aot_eager")
+    with kernels():
+        for n in (5, 7) if dynamic else (6,):
+            got, want = values_and_gradients(compiled, inputs(n)), values_and_gradients(render, inputs(n))
+            assert_close([*got[0], *got[1]], [*want[0], *want[1]], 1e-12)
+
+
+def test_opcheck_of_every_op() -> None:
+    calls: dict[str, tuple[Any, ...]] = {}
+    leaves = inputs(4)
+    with kernels():
+        with record(calls):
+            values_and_gradients(render, leaves)
+        assert set(calls) == {op._qualname for op in OPS}
+        for op in OPS:
+            opcheck(op, calls[op._qualname], test_utils=("test_schema", "test_faketensor"))
+
+
+@contextlib.contextmanager
+def record(calls: dict[str, tuple[Any, ...]]) -> Iterator[None]:
+    """Keep the arguments of each op's last call."""
+    from torch.utils._python_dispatch import TorchDispatchMode
+
+    class Recorder(TorchDispatchMode):
+        def __torch_dispatch__(self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None) -> Any:
+            if func.namespace == "tsplat":
+                calls[func._schema.name] = tuple(a.detach() if isinstance(a, Tensor) else a for a in args)
+            return func(*args, **(kwargs or {}))
+
+    with Recorder():
+        yield
+
+
+@pytest.mark.parametrize("n", [0, 3])
+def test_nothing_to_see(n: int) -> None:
+    """No splats, or all behind the camera: the background, and zero gradients."""
+    leaves = inputs(n)
+    with torch.no_grad():
+        leaves[0][:, 2].fill_(-5.0)
+    with kernels():
+        outputs, gradients = values_and_gradients(render, leaves)
+    assert_close(outputs[0], leaves[7].detach().cpu().expand_as(outputs[0]), 1e-15)
+    assert all(not bool(g.any()) for g in gradients[:5])
+
+
+def test_a_cpu_tensor_never_touches_triton(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: Any) -> None:
+        raise AssertionError("a kernel ran")
+
+    for module in ("projection", "harmonics", "binning", "blending"):
+        monkeypatch.setattr(importlib.import_module(f"tsplat.ops.{module}"), "run_kernel", fail)
+    render(*inputs(device="cpu"))

@@ -1,0 +1,404 @@
+"""What torch expects of an operator: derivatives, fake kernels, compile, export, vmap, autocast, and errors instead of silence."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+import scenes
+import torch
+import tsplat_reference as reference
+from compare import assert_close, assert_same_bits, each, gradients, leaves, permuted, strided
+from conftest import BACKENDS, Backend
+from torch import Tensor
+from torch._dynamo.testing import CompileCounterWithBackend
+from torch._subclasses import FakeTensorMode
+from torch.autograd import forward_ad, gradcheck, gradgradcheck
+from torch.fx.experimental.symbolic_shapes import ShapeEnv
+from torch.library import opcheck
+from torch.testing._internal.optests import aot_autograd_check
+
+import tsplat
+from tsplat import Camera, ops
+
+WIDTH, HEIGHT, TILE = 7, 6, 4
+projection, harmonics, binning, blending = (importlib.import_module(f"tsplat.ops.{name}")        # the package has functions of these names
+                                            for name in ("projection", "harmonics", "binning", "blending"))
+
+
+def project_arguments(antialiased: bool = True, covars: bool = False, n: int = 6) -> tuple[Any, ...]:
+    s, cam = scenes.splats(n, seed=1), scenes.camera(2, WIDTH, HEIGHT)
+    shape = (None, None, reference.covariances(s.quats, s.scales)) if covars else (s.quats, s.scales, None)
+    return (s.means, *shape, s.opacities, cam.viewmats, cam.Ks, WIDTH, HEIGHT, "pinhole", 0.01, 1e10, 0.3, antialiased)
+
+
+def harmonics_arguments(degree: int = 2, n: int = 6) -> tuple[Any, ...]:
+    g = scenes.generator(0)
+    mask = torch.ones(2, n, dtype=torch.bool)
+    mask[0, 1:2] = False
+    return scenes.normal(n, 3, seed=g), scenes.normal(2, 3, seed=g), scenes.sh_coefficients(n, degree), degree, mask
+
+
+def splats2d(n: int = 6) -> scenes.Splats2D:
+    return scenes.splats2d(2, n, WIDTH, HEIGHT, seed=3, size=(0.8, 3.0))
+
+
+def bin_arguments(n: int = 6) -> tuple[Any, ...]:
+    s = splats2d(n)
+    return s.means2d, s.radii, s.conics, s.opacities, s.depths, WIDTH, HEIGHT, TILE
+
+
+def blend_arguments(n: int = 6, background: bool = True, absgrad: bool = True, shared_colors: bool = False) -> tuple[Any, ...]:
+    s = splats2d(n)
+    colors = s.colors[:1] if shared_colors else s.colors
+    bins = reference.bin_splats(*bin_arguments(n))
+    return (s.means2d, s.conics, s.opacities, colors, s.backgrounds if background else None, torch.zeros_like(s.means2d) if absgrad else None,
+            *bins, WIDTH, HEIGHT, TILE, 0.99)
+
+
+def project_backward_arguments(antialiased: bool = True, covars: bool = False, n: int = 6) -> tuple[Any, ...]:
+    args = project_arguments(antialiased, covars, n)
+    radii, *outputs = reference.project(*args)
+    return *args, radii, *(torch.randn_like(x) for x in outputs)
+
+
+def harmonics_backward_arguments(degree: int = 2, n: int = 6) -> tuple[Any, ...]:
+    args = harmonics_arguments(degree, n)
+    return *args, torch.randn_like(reference.harmonics(*args))
+
+
+def blend_backward_arguments(n: int = 6, background: bool = True, absgrad: bool = True, shared_colors: bool = False) -> tuple[Any, ...]:
+    args = blend_arguments(n, background, absgrad, shared_colors)
+    image, alphas = reference.blend(*args[:5], *args[6:])
+    return (*args[:5], *args[6:8], image, alphas, torch.randn_like(image), torch.randn_like(alphas), *args[8:], absgrad)
+
+
+CASES: dict[str, tuple[Any, Callable[..., tuple[Any, ...]], dict[str, Any]]] = {
+    "project": (projection.project_op, project_arguments, {}),
+    "project, covars": (projection.project_op, project_arguments, {"covars": True, "antialiased": False}),
+    "project, N = 0": (projection.project_op, project_arguments, {"n": 0}),
+    "project_backward": (projection.project_backward_op, project_backward_arguments, {}),
+    "project_backward, covars": (projection.project_backward_op, project_backward_arguments, {"covars": True, "antialiased": False}),
+    "project_backward, N = 0": (projection.project_backward_op, project_backward_arguments, {"n": 0}),
+    "harmonics": (harmonics.harmonics_op, harmonics_arguments, {}),
+    "harmonics, degree 0": (harmonics.harmonics_op, harmonics_arguments, {"degree": 0}),
+    "harmonics, N = 0": (harmonics.harmonics_op, harmonics_arguments, {"n": 0}),
+    "harmonics_backward": (harmonics.harmonics_backward_op, harmonics_backward_arguments, {}),
+    "harmonics_backward, degree 0": (harmonics.harmonics_backward_op, harmonics_backward_arguments, {"degree": 0}),
+    "harmonics_backward, N = 0": (harmonics.harmonics_backward_op, harmonics_backward_arguments, {"n": 0}),
+    "bin_splats": (binning.bin_splats_op, bin_arguments, {}),
+    "bin_splats, N = 0": (binning.bin_splats_op, bin_arguments, {"n": 0}),
+    "blend": (blending.blend_op, blend_arguments, {}),
+    "blend, bare": (blending.blend_op, blend_arguments, {"background": False, "absgrad": False, "shared_colors": True}),
+    "blend, N = 0": (blending.blend_op, blend_arguments, {"n": 0}),
+    "blend_backward": (blending.blend_backward_op, blend_backward_arguments, {}),
+    "blend_backward, bare": (blending.blend_backward_op, blend_backward_arguments,
+                             {"background": False, "absgrad": False, "shared_colors": True}),
+    "blend_backward, N = 0": (blending.blend_backward_op, blend_backward_arguments, {"n": 0}),
+}
+FORWARD = [name for name in CASES if "backward" not in name]
+
+
+def case(name: str, backend: Backend) -> tuple[Any, list[Any]]:
+    op, make, options = CASES[name]
+    return op, list(backend.put(make(**options)))
+
+
+def require_grad(args: list[Any], but: tuple[int, ...] = ()) -> list[Any]:
+    return [a.requires_grad_() if isinstance(a, Tensor) and a.is_floating_point() and i not in but else a for i, a in enumerate(args)]
+
+
+# Operator contracts
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_opcheck(backend: Backend, name: str) -> None:
+    """Backward ops are traced without gradients of their own: the second derivative is eager by design, as it runs the reference."""
+    op, args = case(name, backend)
+    if name in FORWARD:
+        args = require_grad(args)
+    checks = ["test_schema", "test_autograd_registration", "test_faketensor"]
+    opcheck(op, args, test_utils=checks)
+
+    def floating(*args: Any) -> list[Tensor]:                                     # opcheck's own version of this fails if an int comes first
+        results = op(*args)
+        return [r for r in ([results] if isinstance(results, Tensor) else results) if r.is_floating_point()] or list(results)
+
+    aot_autograd_check(floating, args, {}, dynamic=True, check_gradients="auto")
+
+
+@pytest.mark.parametrize("layout", [lambda x: x, permuted, strided], ids=["contiguous", "permuted", "strided"])
+@pytest.mark.parametrize("name", CASES)
+def test_fake_kernels_agree_with_real_ones(backend: Backend, name: str, layout: Callable[[Tensor], Tensor]) -> None:
+    """In shapes, dtypes and strides: a compiler plans with the fake ones, and Inductor asserts them."""
+    op, args = case(name, backend)
+    args = each(layout, args)
+    real = op(*args)
+    with FakeTensorMode(shape_env=ShapeEnv()) as mode:
+        fake = op(*each(lambda x: mode.from_tensor(x, static_shapes=True), args))
+    real, fake = ([x] if isinstance(x, Tensor) else x for x in (real, fake))
+    for i, (r, f) in enumerate(zip(real, fake, strict=True)):
+        assert r.dtype == f.dtype, i
+        assert r.device == f.device, i
+        assert r.ndim == f.ndim, i
+        if any(isinstance(s, torch.SymInt) for s in f.shape):
+            assert (name.split(",")[0], i) == ("bin_splats", 0)                   # the number of hits depends on the data
+            assert r.stride() == (1,)
+            continue
+        assert r.shape == f.shape, i
+        if r.numel() > 1:
+            assert [s for s, n in zip(r.stride(), r.shape, strict=True) if n > 1] == [
+                s for s, n in zip(f.stride(), f.shape, strict=True) if n > 1], i
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_where_there_is_no_triton_other_devices_than_the_cpu_are_refused_clearly(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """With the CPU kernel out of the way, a CPU tensor stands for one on another device."""
+    op, args = case(name, BACKENDS["reference"])
+    for module in [m for m in sys.modules if m.startswith("tsplat.kernels.")]:
+        monkeypatch.delitem(sys.modules, module)
+    monkeypatch.setitem(sys.modules, "triton", None)                              # an import of it fails as if it were not there
+    message = rf"{name.split(',')[0]} on device 'cpu' needs Triton, which is not installed"
+    with op.set_kernel_enabled("cpu", False), pytest.raises(NotImplementedError, match=message):
+        op(*args)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_meta_tensors_go_to_the_fake_kernel(name: str) -> None:
+    op, args = case(name, BACKENDS["reference"])
+    if name.startswith("bin_splats"):                                             # how many hits there are depends on the data
+        with pytest.raises(Exception, match="data"):
+            op(*each(lambda x: x.to("meta"), args))
+        return
+    result = op(*each(lambda x: x.to("meta"), args))
+    for got, want in zip(*([x] if isinstance(x, Tensor) else x for x in (result, op(*args))), strict=True):
+        assert got.device.type == "meta"
+        assert (got.shape, got.dtype) == (want.shape, want.dtype)
+
+
+# Derivatives
+
+
+def differentiable_case(name: str, backend: Backend) -> tuple[Callable[..., Any], list[Tensor]]:
+    """The public function of a case, of its differentiable arguments only, and these."""
+    _, args = case(name, backend)
+    stage = name.split(",")[0]
+    which = {"project": (0, 1, 2, 3, 5, 6), "harmonics": (0, 1, 2), "blend": (0, 1, 2, 3, 4)}[stage]
+    which = [i for i in which if args[i] is not None]
+    inputs = leaves(*(args[i] for i in which))
+    function = getattr(ops, stage)
+
+    def call(*tensors: Tensor) -> list[Tensor]:
+        mine = list(args)
+        for i, tensor in zip(which, tensors, strict=True):
+            mine[i] = (tensor + tensor.mT) / 2 if i == 3 and stage == "project" else tensor     # covariances are symmetric
+        results = function(*mine)
+        return [r for r in ([results] if isinstance(results, Tensor) else results) if r.is_floating_point() and r.requires_grad]
+
+    return call, inputs
+
+
+DIFFERENTIABLE = [name for name in FORWARD if not name.startswith("bin") and "N = 0" not in name]
+
+
+@pytest.mark.parametrize("name", DIFFERENTIABLE)
+def test_gradients_are_finite_differences(backend: Backend, name: str) -> None:
+    call, inputs = differentiable_case(name, backend)
+    assert gradcheck(call, inputs)
+
+
+@pytest.mark.parametrize("name", DIFFERENTIABLE)
+def test_second_derivatives_are_finite_differences(backend: Backend, name: str) -> None:
+    call, inputs = differentiable_case(name, backend)
+    assert gradgradcheck(call, inputs, fast_mode=True)
+
+
+@pytest.mark.parametrize("name", [n for n in FORWARD if not n.startswith("bin")])
+def test_expanded_upstream_gradients(backend: Backend, name: str) -> None:
+    """That of a sum has stride 0 everywhere; gradcheck never makes one."""
+    call, inputs = differentiable_case(name, backend)
+    outputs = call(*inputs)
+    dense = torch.autograd.grad(outputs, inputs, [torch.ones_like(o) for o in outputs], retain_graph=True)
+    assert_same_bits(torch.autograd.grad(sum(o.sum() for o in outputs), inputs), dense)
+
+
+def test_the_order_of_splats_has_no_gradient_and_needs_none(backend: Backend) -> None:
+    _, args = case("bin_splats", backend)
+    assert not any(x.requires_grad for x in ops.bin_splats(*require_grad(args)))
+
+
+@pytest.mark.parametrize("name", DIFFERENTIABLE)
+def test_forward_mode_is_an_error_not_silence(backend: Backend, name: str) -> None:
+    call, inputs = differentiable_case(name, backend)
+    for i in range(len(inputs)):
+        with forward_ad.dual_level(), pytest.raises(NotImplementedError, match="no forward-mode derivative"):
+            call(*(forward_ad.make_dual(x, torch.ones_like(x)) if i == j else x for j, x in enumerate(inputs)))
+
+
+def render(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor, viewmats: Tensor, Ks: Tensor, background: Tensor,
+           offset: Tensor, width: int = WIDTH, height: int = HEIGHT) -> tuple[Tensor, Tensor, Tensor]:
+    """All stages and options at once."""
+    r = tsplat.rasterize(means, quats, scales, opacities, sh, Camera(viewmats, Ks, width, height), sh_degree=1, background=background,
+                         depth="expected", antialiased=True, screen_offset=offset)
+    return r.image, r.alpha, r.depth
+
+
+def render_arguments(backend: Backend, n: int = 6, width: int = WIDTH, height: int = HEIGHT) -> list[Tensor]:
+    s, cam = scenes.splats(n, seed=2, size=(0.2, 0.6), spread=0.8), scenes.camera(2, width, height)
+    return leaves(*backend.put((*s[:4], scenes.sh_coefficients(n, 1), cam.viewmats, cam.Ks, torch.tensor([0.1, 0.2, 0.3]),
+                                torch.zeros(2, n, 2))))
+
+
+def test_the_whole_renderer_has_first_and_second_derivatives(backend: Backend) -> None:
+    args = render_arguments(backend, 3, 5, 4)
+    assert gradcheck(lambda *a: render(*a, 5, 4), args, fast_mode=True)
+    assert gradgradcheck(lambda *a: render(*a, 5, 4), args, fast_mode=True)
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("option", ["colors", "sh", "depth", "covars"])
+def test_the_renderer_is_differentiable_twice_with_every_option(backend: Backend, option: str, antialiased: bool) -> None:
+    """Each way through the stages, against finite differences of the gradient."""
+    means, quats, scales, opacities, sh, viewmats, Ks, background, _ = render_arguments(backend, 3, 5, 4)
+    inputs = [means, opacities, background, viewmats]
+
+    def call(means: Tensor, opacities: Tensor, background: Tensor, viewmats: Tensor) -> list[Tensor]:
+        shape = {"covars": reference.covariances(quats, scales)} if option == "covars" else {}
+        r = tsplat.rasterize(means, *((None, None) if shape else (quats, scales)), opacities, sh if option == "sh" else sh[:, 0],
+                             Camera(viewmats, Ks, 5, 4), sh_degree=1 if option == "sh" else None, background=background,
+                             depth="accumulated" if option == "depth" else None, antialiased=antialiased, **shape)
+        return [r.image, r.alpha, *([r.depth] if option == "depth" else [])]
+
+    assert gradgradcheck(call, inputs, fast_mode=True)
+
+
+# Compilers
+
+
+@pytest.fixture
+def fresh_dynamo() -> Iterator[None]:
+    """Without what other tests compiled."""
+    torch._dynamo.reset()
+    yield
+    torch._dynamo.reset()
+
+
+@pytest.mark.parametrize("dynamic", [False, True])
+@pytest.mark.usefixtures("fresh_dynamo")
+def test_the_renderer_compiles_whole_with_its_gradients(backend: Backend, dynamic: bool) -> None:
+    """The screen-space gradient that density control needs (that of the zero offset, the last argument) included."""
+    args = render_arguments(backend)
+    want = render(*args)
+    got = torch.compile(render, fullgraph=True, backend="aot_eager", dynamic=dynamic)(*args)
+    assert_same_bits(got, want)
+    v_got, v_want = gradients(got, args), gradients(want, args)
+    assert_close(v_got, v_want, 1e-14)
+    assert (v_got[-1] != 0).any()
+
+
+@pytest.mark.usefixtures("fresh_dynamo")
+def test_one_compilation_serves_all_sizes(backend: Backend) -> None:
+    """Of splats and of the image, the gradient included; numbers of hits differ, too."""
+    counter = CompileCounterWithBackend("aot_eager")
+    compiled = torch.compile(render, fullgraph=True, backend=counter, dynamic=True)
+    counts = []
+    for n, width, height in ((6, 10, 9), (9, 10, 9), (14, 33, 17), (5, 12, 30)):
+        args = render_arguments(backend, n, width, height)
+        got, want = compiled(*args, width, height), render(*args, width, height)
+        assert_same_bits(got, want)
+        assert_close(gradients(got, args), gradients(want, args), 1e-14)
+        counts.append(counter.frame_count)                                        # the first compilation may make several attempts
+    assert counts == [counts[0]] * 4
+    compiled(*render_arguments(backend), WIDTH, 1)
+    assert counter.frame_count > counts[0]                                        # a size of 1 is a case of its own: the counter counts
+
+
+@pytest.mark.usefixtures("fresh_dynamo")
+def test_a_camera_object_passes_into_compiled_code(backend: Backend) -> None:
+    s, cam = scenes.splats(6), scenes.camera(None, WIDTH, HEIGHT, model="fisheye")
+    s, cam = backend.put((s, cam))
+
+    def shot(splats: scenes.Splats3D, camera: Camera) -> tuple[Tensor, Tensor]:
+        r = tsplat.rasterize(*splats, camera)
+        return r.image, r.meta.hits
+
+    assert_same_bits(torch.compile(shot, fullgraph=True, backend="aot_eager")(s, cam), shot(s, cam))
+
+
+class Model(torch.nn.Module):
+    """Parameters that render themselves."""
+
+    def __init__(self, *parameters: Tensor) -> None:
+        super().__init__()
+        self.parameters_ = torch.nn.ParameterList([p.detach() for p in parameters])
+
+    def forward(self, viewmats: Tensor, Ks: Tensor) -> Tensor:
+        """The image."""
+        return tsplat.rasterize(*self.parameters_, Camera(viewmats, Ks, WIDTH, HEIGHT), sh_degree=1).image
+
+
+@pytest.mark.parametrize("strict", [False, True])
+@pytest.mark.usefixtures("fresh_dynamo")
+def test_a_model_that_renders_exports(backend: Backend, strict: bool) -> None:
+    *parameters, viewmats, Ks, _, _ = (x.detach() for x in render_arguments(backend))
+    model = Model(*parameters)
+    program = torch.export.export(model, (viewmats, Ks), strict=strict)
+    names = {str(node.target) for node in program.graph.nodes}
+    assert {f"tsplat.{stage}.default" for stage in ("project", "harmonics", "bin_splats", "blend")} <= names
+    other = viewmats.flip(0).clone()
+    other[:, 0, 3] += 0.3                                                         # another number of hits than when it was traced
+    assert_same_bits([program.module()(other, Ks)], [model(other, Ks)])
+
+
+def test_vmap_over_cameras_is_the_batch(backend: Backend) -> None:
+    _, args = case("project", backend)
+    viewmats, Ks = args[5:7]
+    mapped = torch.func.vmap(lambda v, K: ops.project(*args[:5], v[None], K[None], *args[7:]))(viewmats, Ks)
+    assert_same_bits([x[:, 0] for x in mapped], ops.project(*args))
+    _, (means, centers, coeffs, degree, mask) = case("harmonics", backend)
+    colors = torch.func.vmap(lambda c, m: ops.harmonics(means, c[None], coeffs, degree, m[None]))(centers, mask)
+    assert_close(colors[:, 0], ops.harmonics(means, centers, coeffs, degree, mask), 1e-15)
+
+
+def test_gradients_through_vmap_are_those_of_the_batch(backend: Backend) -> None:
+    _, args = case("project", backend)
+    inputs = leaves(*args[5:7])
+    mapped = torch.func.vmap(lambda v, K: ops.project(*args[:5], v[None], K[None], *args[7:]))(*inputs)
+    assert_close(gradients([x[:, 0] for x in mapped[1:]], inputs), gradients(ops.project(*args[:5], *inputs, *args[7:])[1:], inputs), 1e-15)
+
+
+# Autocast
+
+
+@pytest.mark.parametrize("name", FORWARD)
+def test_ops_compute_in_float32_under_autocast(backend: Backend, name: str) -> None:
+    """Half-precision arguments, as other layers under autocast leave them, are taken to float32."""
+    op, args = case(name, backend)
+    half = each(lambda x: x.to(torch.bfloat16) if x.is_floating_point() else x, args)
+    full = each(lambda x: x.float() if x.is_floating_point() else x, half)
+    with torch.autocast(backend.device.type, torch.bfloat16):
+        got = op(*half)
+    got, want = ([x] if isinstance(x, Tensor) else x for x in (got, op(*full)))
+    assert torch.float32 in {x.dtype for x in got} or name.startswith("bin_splats")
+    assert_same_bits(got, want)
+
+
+@pytest.mark.parametrize("sh_degree", [None, 2])
+def test_autocast_does_not_change_the_renderer(backend: Backend, sh_degree: int | None) -> None:
+    s = [x.float() for x in scenes.splats(20)]
+    cam = scenes.camera(3).to(torch.float32)
+    colors = s[4] if sh_degree is None else scenes.sh_coefficients(20, sh_degree).float()
+    inputs = leaves(*s[:4], colors, cam.viewmats, cam.Ks)
+
+    def run() -> list[Tensor]:
+        r = tsplat.rasterize(*inputs[:5], Camera(*inputs[5:], 24, 17), sh_degree=sh_degree, depth="expected", antialiased=True)
+        return [r.image, r.alpha, r.depth]
+
+    want = run()
+    with torch.autocast(backend.device.type, torch.bfloat16):
+        got = run()
+    assert_same_bits(got, want)
+    assert_same_bits(gradients(got, inputs), gradients(want, inputs))

@@ -1,0 +1,132 @@
+"""Work on several threads: the same bits, the caller's settings, and no deadlock."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
+import pytest
+import scenes
+import torch
+from compare import assert_same_bits, gradients, leaves, threads
+from torch import Tensor
+from tsplat_reference import parallel
+
+from tsplat import rasterize
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def results() -> list[Tensor]:
+    """Image and gradients of a scene with several groups of blocks."""
+    s, cam = scenes.splats(500, seed=4), scenes.camera(2, 64, 56)
+    inputs = leaves(*s[:4], scenes.sh_coefficients(500, 2))
+    r = rasterize(*inputs, cam, sh_degree=2, depth="expected", antialiased=True)
+    outputs = [r.image, r.alpha, r.depth]
+    return [*outputs, *gradients(outputs, inputs)]
+
+
+def test_results_have_the_same_bits_with_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tsplat_reference.blocks.GROUP_TILES", 8)                 # more groups than threads
+    monkeypatch.setattr("tsplat_reference.projection.CHUNK", 64)
+    with threads(1):
+        want = results()
+    for count in (2, 3):
+        with threads(count):
+            assert_same_bits(results(), want)
+            assert_same_bits(results(), want)
+
+
+def test_pieces_run_on_the_workers_and_come_in_order() -> None:
+    names: set[str] = set()
+
+    def work(rows: slice) -> int:
+        names.add(threading.current_thread().name)
+        assert torch.get_num_threads() == 1                                       # torch's own threads would take the cores away
+        assert not torch.is_grad_enabled()
+        return rows.start
+
+    with threads(2):
+        assert parallel.map_chunks(work, 50, 3) == list(range(0, 50, 3))
+        assert all("tsplat" in name for name in names)
+        names.clear()
+    with threads(1):
+        assert parallel.map_chunks(work, 50, 3) == list(range(0, 50, 3))
+        assert names == {threading.current_thread().name}
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_the_number_of_threads_is_as_before(count: int) -> None:
+    with threads(count):
+        results()
+        assert torch.get_num_threads() == count
+        seen: list[int] = []
+        other = threading.Thread(target=lambda: seen.append(torch.get_num_threads()))
+        other.start()
+        other.join()
+        assert seen == [count]                                                    # for threads yet to come, too
+
+
+def fail(rows: slice) -> int:
+    if rows.start == 4:
+        raise RuntimeError("piece 4")
+    return rows.start
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_an_error_in_a_piece_reaches_the_caller_and_leaves_things_in_order(count: int) -> None:
+    with threads(count):
+        with pytest.raises(RuntimeError, match="piece 4"):
+            parallel.map_chunks(fail, 10, 1)
+        assert torch.get_num_threads() == count
+        assert parallel.map_chunks(lambda rows: rows.start, 4, 1) == [0, 1, 2, 3]
+
+
+def test_few_results_wait() -> None:
+    """A producer far ahead of its consumer would hold them all in memory."""
+    done: list[int] = []
+    with threads(2), parallel.workers() as ordered_map:
+        for i, _ in enumerate(ordered_map(done.append, range(40))):
+            assert len(done) <= i + 1 + 4
+
+
+def test_threads_of_the_caller_may_render_at_the_same_time() -> None:
+    want = results()
+    found: dict[int, list[Tensor]] = {}
+
+    def work(i: int) -> None:
+        found[i] = results()
+
+    running = [threading.Thread(target=work, args=(i,), daemon=True) for i in range(3)]
+    with threads(2):
+        for t in running:
+            t.start()
+        for t in running:
+            t.join(60)
+        assert torch.get_num_threads() == 2
+    assert sorted(found) == [0, 1, 2]
+    for mine in found.values():
+        assert_same_bits(mine, want)
+
+
+FORK = """
+import os, sys, torch
+from tsplat_reference import parallel
+torch.set_num_threads(2)
+work = lambda: parallel.map_chunks(lambda rows: rows.start, 6, 1)
+assert work() == [0, 1, 2, 3, 4, 5]
+child = os.fork()
+if child == 0:
+    os._exit(0 if work() == [0, 1, 2, 3, 4, 5] else 1)
+sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
+def test_a_forked_process_starts_workers_of_its_own() -> None:
+    """Threads do not survive a fork. (Torch's own hang after one, so a child renders with one thread, as DataLoader sets it.)"""
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "reference")])}
+    subprocess.run([sys.executable, "-W", "ignore", "-c", FORK], env=environment, timeout=60, check=True)

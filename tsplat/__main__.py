@@ -1,0 +1,7 @@
+"""`python -m tsplat`: the command line."""
+
+import sys
+
+from tsplat.cli import main
+
+sys.exit(main())

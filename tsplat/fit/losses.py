@@ -1,0 +1,75 @@
+"""What is minimised and what is measured: L1, SSIM and PSNR of a render against a photo.
+
+SSIM (Wang et al. 2004) is kornia's: an 11x11 Gaussian window of sigma 1.5, per channel. Images are padded with zeros, as
+the 3DGS code does, so that figures compare with its and images of any size have one.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+from torch.nn.functional import pad
+
+WINDOW = 11
+SSIM_NAME = "11x11 Gaussian window, sigma 1.5, zero padding, mean over channels and pixels"
+
+
+class Target(NamedTuple):
+    """What a render is compared with.
+
+    Args:
+        image: `[H, W, 3]` in 0..1, the photo over the background.
+        mask: `[H, W, 1]` in 0..1, 0 where a pixel does not count, or None if all do.
+    """
+
+    image: Tensor
+    mask: Tensor | None = None
+
+    def average(self, values: Tensor) -> Tensor:
+        """Mean of `[H, W, C]` over channels and the pixels that count; 0 where none does."""
+        if self.mask is None:
+            return values.mean()
+        return (values * self.mask).sum() / (self.mask.sum() * values.shape[-1]).clamp(min=1)
+
+
+def target_of(photo: Tensor, background: Tensor, *, masked: bool) -> Target:
+    """The target that a photo `[H, W, 3 or 4]` gives; its fourth channel is a mask if `masked`, else its alpha."""
+    if photo.shape[-1] == 3:
+        return Target(photo)
+    image, fourth = photo[..., :3], photo[..., 3:]
+    return Target(image, fourth) if masked else Target(image * fourth + (1 - fourth) * background)
+
+
+def photo_loss(image: Tensor, target: Target, ssim_weight: float) -> Tensor:
+    """(1 - w) L1 + w (1 - SSIM) (3DGS, equation 7) of `[H, W, 3]`: a scalar. Pixels that do not count get no gradient."""
+    image = _fill(image, target)
+    loss = (1 - ssim_weight) * target.average((image - target.image).abs())
+    if ssim_weight:
+        loss = loss + ssim_weight * (1 - target.average(ssim_map(image, target.image)))
+    return loss
+
+
+def psnr(image: Tensor, target: Target) -> Tensor:
+    """Peak signal-to-noise ratio in dB, for a peak of 1, over the pixels that count; at most 100."""
+    return -10 * target.average((image - target.image).square()).clamp(min=1e-10).log10()
+
+
+def ssim(image: Tensor, target: Target) -> Tensor:
+    """Mean structural similarity over the pixels that count, at most 1."""
+    return target.average(ssim_map(_fill(image, target), target.image))
+
+
+def ssim_map(a: Tensor, b: Tensor) -> Tensor:
+    """Structural similarity `[H, W, 3]` of two images `[H, W, 3]`, of any size, with zeros around them."""
+    from kornia.metrics import ssim as kornia_ssim
+
+    a, b = (pad(image.permute(2, 0, 1)[None], (WINDOW // 2,) * 4) for image in (a, b))          # [1, 3, H + 10, W + 10]
+    similarity: Tensor = kornia_ssim(a, b, WINDOW, padding="valid")
+    return similarity[0].permute(1, 2, 0)
+
+
+def _fill(image: Tensor, target: Target) -> Tensor:
+    """`image`, with the photo where pixels do not count, so that windows across the border see no difference there."""
+    return image if target.mask is None else torch.lerp(target.image, image, target.mask)

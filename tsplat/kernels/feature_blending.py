@@ -1,0 +1,128 @@
+"""Blending of 5 to 512 and more channels as matrix products: weights [pixels, splats] times features [splats, channels].
+
+The arithmetic of 16 channels and more is in the products, which the tensor cores do; peers loop over the channels on the scalar units.
+A program takes a quarter of a tile's pixels, so that its accumulators stay in registers, and a block of channels.
+"""
+
+from __future__ import annotations
+
+import triton
+import triton.language as tl
+
+from tsplat.kernels.footprint import LOG2_MIN, T_MIN, TILE
+
+
+@triton.jit
+def part_pixels(part, tiles_x, tiles_y, W, H, like, P: tl.constexpr):
+    """P pixels of a tile: its number, the camera, x and y `[P, 1]` about the tile's centre, that centre, the indices and which exist."""
+    parts: tl.constexpr = TILE * TILE // P
+    tile = part // parts
+    p = part % parts * P + tl.arange(0, P)
+    view = tile // (tiles_x * tiles_y)
+    left = (tile % tiles_x) * TILE
+    top = (tile // tiles_x) % tiles_y * TILE
+    half: tl.constexpr = TILE / 2
+    column = left + p % TILE
+    row = top + p // TILE
+    x = ((p % TILE).to(like) + (0.5 - half))[:, None]
+    y = ((p // TILE).to(like) + (0.5 - half))[:, None]
+    pixel = (view.to(tl.int64) * H + row) * W + column
+    return tile, view, x, y, left.to(like) + half, top.to(like) + half, pixel, (column < W) & (row < H)
+
+
+@triton.jit
+def chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha: tl.constexpr, ALPHA_MAX: tl.constexpr, K: tl.constexpr):
+    """K splats at P pixels: indices `[K]`, record fields `[1, K]`, alpha (0 where it does not count), weight, and T behind them `[P]`."""
+    j = i + tl.arange(0, K)
+    splat = tl.load(ids + j, mask=j < end, other=null).to(tl.int64)
+    p = (records + splat * 12)[None, :]
+    mx = tl.load(p) - cx
+    my = tl.load(p + 1) - cy
+    l00 = tl.load(p + 2)
+    l10 = tl.load(p + 3)
+    l11 = tl.load(p + 4)
+    power = log2_alpha(mx, my, l00, l10, l11, tl.load(p + 5), x, y)
+    alpha = tl.minimum(tl.exp2(power), tl.full((), ALPHA_MAX, x.dtype))
+    alpha = tl.where(power >= LOG2_MIN, alpha, 0.0)                     # [P, K]
+    behind = T[:, None] * tl.cumprod(1.0 - alpha, 1)
+    front = behind / (1.0 - alpha)
+    counts = front > T_MIN
+    alpha = tl.where(counts, alpha, 0.0)
+    return splat, mx, my, l00, l10, l11, alpha, front * alpha, tl.min(tl.where(counts, behind, T[:, None]), 1)
+
+
+@triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null", "N"])
+def feature_fwd_kernel(records, colors, ids, offsets, backgrounds, image, alphas, W, H, tiles_x, tiles_y, null, N, D,
+                       BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, P: tl.constexpr, K: tl.constexpr,
+                       DB: tl.constexpr, PRECISION: tl.constexpr):
+    """DB channels of the image at P pixels of a tile."""
+    dt: tl.constexpr = records.dtype.element_ty
+    tile, view, x, y, cx, cy, pixel, inside = part_pixels(tl.program_id(0), tiles_x, tiles_y, W, H, dt, P)
+    d = tl.program_id(1) * DB + tl.arange(0, DB)
+    T = inside.to(dt)
+    total = tl.zeros([P, DB], dt)
+    i = tl.load(offsets + tile)
+    end = tl.load(offsets + tile + 1)
+    alive = True
+    while (i < end) & alive:
+        splat, _, _, _, _, _, _, w, T = chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha, ALPHA_MAX, K)
+        real = (i + tl.arange(0, K) < end)[:, None] & (d < D)[None, :]
+        F = tl.load(colors + (splat % N)[:, None] * D + d[None, :], mask=real, other=0.0)
+        total = tl.dot(w, F, total, input_precision=PRECISION, out_dtype=dt)
+        i += K
+        alive = tl.max(T, 0) > T_MIN
+    mask = inside[:, None] & (d < D)[None, :]
+    if BACKGROUND:
+        total += T[:, None] * tl.load(backgrounds + view * D + d, mask=d < D, other=0.0)[None, :]
+    tl.store(image + pixel[:, None] * D + d[None, :], total, mask=mask)
+    if tl.program_id(1) == 0:
+        tl.store(alphas + pixel, 1.0 - T, mask=inside)
+
+
+@triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null", "N"])
+def feature_bwd_kernel(records, colors, ids, offsets, rest_image, v_weights, v_image, sums, v_colors, W, H, tiles_x, tiles_y, null, N, D,
+                       ABSGRAD: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, block_moments: tl.constexpr,
+                       mean_slopes: tl.constexpr, P: tl.constexpr, K: tl.constexpr, DB: tl.constexpr, PRECISION: tl.constexpr):
+    """Sums `[R, 16]` of the geometry and gradients of the features, by atomics; as `blend_bwd_kernel`, with K splats at a time."""
+    dt: tl.constexpr = records.dtype.element_ty
+    tile, _, x, y, cx, cy, pixel, inside = part_pixels(tl.program_id(0), tiles_x, tiles_y, W, H, dt, P)
+    T = inside.to(dt)
+    rest = tl.load(rest_image + pixel, mask=inside, other=0.0)
+    v_weight = tl.load(v_weights + pixel, mask=inside, other=0.0)
+    i = tl.load(offsets + tile)
+    end = tl.load(offsets + tile + 1)
+    alive = True
+    while (i < end) & alive:
+        splat, mx, my, l00, l10, l11, alpha, w, T = chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha, ALPHA_MAX, K)
+        real = i + tl.arange(0, K) < end
+        row = (splat % N) * D
+        g = tl.zeros([P, K], dt) + v_weight[:, None]
+        begin = 0
+        while begin < D:
+            d = begin + tl.arange(0, DB)
+            V = tl.load(v_image + pixel[:, None] * D + d[None, :], mask=inside[:, None] & (d < D)[None, :], other=0.0)
+            F = tl.load(colors + row[None, :] + d[:, None], mask=real[None, :] & (d < D)[:, None], other=0.0)        # [DB, K]
+            g = tl.dot(V, F, g, input_precision=PRECISION, out_dtype=dt)
+            # [DB, K] rather than [K, DB]: a product of only 16 rows would be replicated over the warps, and spill
+            v_F = tl.dot(tl.trans(V), w, input_precision=PRECISION, out_dtype=dt)
+            tl.atomic_add(v_colors + row[None, :] + d[:, None], v_F, mask=real[None, :] & (d < D)[:, None], sem="relaxed")
+            begin += DB
+        wg = w * g
+        v = wg - alpha / (1.0 - alpha) * (rest[:, None] - tl.cumsum(wg, 1))
+        v = tl.where(alpha < tl.full((), ALPHA_MAX, dt), v, 0.0)
+        rest -= tl.sum(wg, 1)
+        s0, sx, sy, sxx, sxy, syy = block_moments(v, mx, my, x, y)
+        q = (sums + splat * 16)[None, :]
+        mask = real[None, :]
+        tl.atomic_add(q, s0, mask=mask, sem="relaxed")
+        tl.atomic_add(q + 1, sx, mask=mask, sem="relaxed")
+        tl.atomic_add(q + 2, sy, mask=mask, sem="relaxed")
+        tl.atomic_add(q + 3, sxx, mask=mask, sem="relaxed")
+        tl.atomic_add(q + 4, sxy, mask=mask, sem="relaxed")
+        tl.atomic_add(q + 5, syy, mask=mask, sem="relaxed")
+        if ABSGRAD:
+            slope_x, slope_y = mean_slopes(mx, my, l00, l10, l11, x, y)
+            tl.atomic_add(q + 10, tl.sum(tl.abs(v * slope_x), 0, keep_dims=True), mask=mask, sem="relaxed")
+            tl.atomic_add(q + 11, tl.sum(tl.abs(v * slope_y), 0, keep_dims=True), mask=mask, sem="relaxed")
+        i += K
+        alive = tl.max(T, 0) > T_MIN

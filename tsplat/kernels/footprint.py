@@ -1,0 +1,118 @@
+"""The Gaussian footprint as device functions: what blending knows of the shape of a splat.
+
+A kernel gets `log2_alpha` and the sums of its derivative as constexprs and has no formula of its own, so that another footprint is another
+set of these functions. A record is 12 numbers, three 16-byte loads: mean x, mean y, l00, l10 | l11, log2 opacity, colour 0, 1 | colour 2,
+3, two that pad (colours only up to 4 channels), with
+
+    log2 alpha = log2 o - (l00 dx + l10 dy)^2 - (l11 dy)^2,
+
+the Cholesky factor of the conic times sqrt(log2(e)/2): one FFMA less per pixel than the conic, and better conditioned where a long thin
+splat is centred far away. Positions are relative to the centre of the tile.
+"""
+
+import math
+
+import triton
+import triton.language as tl
+from tsplat_reference.constants import ALPHA_MIN, TRANSMITTANCE_MIN
+
+LOG2_MIN = tl.constexpr(math.log2(ALPHA_MIN))
+T_MIN = tl.constexpr(TRANSMITTANCE_MIN)
+TILE = tl.constexpr(16)
+"""Side of a tile: 256 pixels are 8 for each lane of a warp."""
+RECORD = 12
+"""Numbers in a record."""
+MOMENTS = 6
+"""Sums that the backward collects for the geometry of a splat: v times 1, dx, dy, dx^2, dx dy, dy^2, with v = dL/dlog alpha."""
+
+
+@triton.jit
+def log2_alpha(mx, my, l00, l10, l11, log2_opacity, x, y):
+    """At positions x, y; the terms in y alone are computed once where y has fewer elements than x (a lane's pixels share a row)."""
+    dy = y - my
+    v = l11 * dy
+    u = l00 * x + (l10 * dy - l00 * mx)
+    return (log2_opacity - v * v) - u * u
+
+
+@triton.jit
+def mean_slopes(mx, my, l00, l10, l11, x, y):
+    """dlog alpha/dmean x and y, over 2 ln 2."""
+    dy = y - my
+    u = l00 * x + (l10 * dy - l00 * mx)
+    return l00 * u, l10 * u + l11 * (l11 * dy)
+
+
+@triton.jit
+def lane_moments(v, mx, my, x, y):
+    """Per lane: the six sums over the pixels v `[32, PX]` of a row segment at x `[32, PX]`, y `[32, 1]`."""
+    vx = v * x
+    s0 = tl.sum(v, 1, keep_dims=True)
+    local = tl.sum(vx, 1, keep_dims=True)
+    sx = local - mx * s0                                # shifted from the tile's centre to the mean once per row, not per pixel
+    sxx = tl.sum(vx * x, 1, keep_dims=True) - mx * (local + sx)
+    dy = y - my
+    sy = s0 * dy
+    return s0, sx, sy, sxx, sx * dy, sy * dy
+
+
+@triton.jit
+def block_moments(v, mx, my, x, y):
+    """The six sums `[1, K]` over the pixels (rows) of v `[P, K]`."""
+    dx = x - mx
+    dy = y - my
+    vx = v * dx
+    vy = v * dy
+    return (tl.sum(v, 0, keep_dims=True), tl.sum(vx, 0, keep_dims=True), tl.sum(vy, 0, keep_dims=True),
+            tl.sum(vx * dx, 0, keep_dims=True), tl.sum(vx * dy, 0, keep_dims=True), tl.sum(vy * dy, 0, keep_dims=True))
+
+
+@triton.jit(do_not_specialize=["R", "N"])
+def pack_kernel(means2d, conics, opacities, colors, records, R, N, D: tl.constexpr, BLOCK: tl.constexpr):
+    """Records of splats; culled ones (conic 0) get finite numbers. Record R is the null splat, which is nowhere.
+
+    Colours have N rows, of which splat i takes i mod N: here once per splat, so that blending need not.
+    """
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    real = i < R
+    dt: tl.constexpr = records.dtype.element_ty
+    scale = tl.full((), 0.8493218002880191, dt)         # sqrt(log2(e) / 2); a literal would be rounded to float32
+    a = tl.load(conics + 3 * i, mask=real, other=0.0)
+    b = tl.load(conics + 3 * i + 1, mask=real, other=0.0)
+    c = tl.load(conics + 3 * i + 2, mask=real, other=0.0)
+    some = a > 0
+    l00 = tl.sqrt(tl.where(some, a, 1.0))
+    l10 = tl.where(some, b / l00, 0.0)
+    l11 = tl.sqrt(tl.maximum(c - l10 * l10, 0.0))
+    opacity = tl.load(opacities + i, mask=real, other=0.0)
+    inside = i <= R
+    p = records + 12 * i
+    tl.store(p, tl.load(means2d + 2 * i, mask=real, other=0.0), mask=inside)
+    tl.store(p + 1, tl.load(means2d + 2 * i + 1, mask=real, other=0.0), mask=inside)
+    tl.store(p + 2, tl.where(some, l00 * scale, 0.0), mask=inside)
+    tl.store(p + 3, l10 * scale, mask=inside)
+    tl.store(p + 4, l11 * scale, mask=inside)
+    tl.store(p + 5, tl.where(opacity > 0, tl.log2(tl.where(opacity > 0, opacity, 1.0)), -1e9), mask=inside)
+    for channel in tl.static_range(D):
+        tl.store(p + 6 + channel, tl.load(colors + (i % N) * D + channel, mask=real, other=0.0), mask=inside)
+
+
+@triton.jit(do_not_specialize=["R"])
+def unpack_kernel(sums, conics, opacities, v_means2d, v_conics, v_opacities, R, STRIDE: tl.constexpr, BLOCK: tl.constexpr):
+    """Moments `[R, STRIDE]` to the gradients of means2d, conics and opacities."""
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    real = i < R
+    a = tl.load(conics + 3 * i, mask=real, other=0.0)
+    b = tl.load(conics + 3 * i + 1, mask=real, other=0.0)
+    c = tl.load(conics + 3 * i + 2, mask=real, other=0.0)
+    opacity = tl.load(opacities + i, mask=real, other=0.0)
+    p = sums + STRIDE * i
+    s0 = tl.load(p, mask=real, other=0.0)
+    sx = tl.load(p + 1, mask=real, other=0.0)
+    sy = tl.load(p + 2, mask=real, other=0.0)
+    tl.store(v_means2d + 2 * i, a * sx + b * sy, mask=real)
+    tl.store(v_means2d + 2 * i + 1, b * sx + c * sy, mask=real)
+    tl.store(v_conics + 3 * i, -0.5 * tl.load(p + 3, mask=real, other=0.0), mask=real)
+    tl.store(v_conics + 3 * i + 1, -tl.load(p + 4, mask=real, other=0.0), mask=real)
+    tl.store(v_conics + 3 * i + 2, -0.5 * tl.load(p + 5, mask=real, other=0.0), mask=real)
+    tl.store(v_opacities + i, tl.where(opacity > 0, s0 / tl.where(opacity > 0, opacity, 1.0), 0.0), mask=real)

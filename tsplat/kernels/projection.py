@@ -1,0 +1,346 @@
+"""Projection of Gaussians to 2D splats: a thread per pair of camera and splat; its backward: a thread per splat, a loop over the cameras.
+
+The twin of `tsplat_reference.projection`, better conditioned in three places, which tells in float32. A covariance given as quaternion and
+scales is never formed: with F = R S, Sigma' = T T^T for T = J W F. Its determinant is then |T0 x T1|^2, without cancellation for
+needles, and that of Sigma' + eps2d I is det + eps2d (trace + eps2d). And the gradient of the conic Q is -Q v_Q Q.
+"""
+
+from __future__ import annotations
+
+import torch
+import triton
+import triton.language as tl
+from torch import Tensor
+from tsplat_reference.constants import ALPHA_MIN, COMPENSATION_MIN, EXTENT_MAX, FRUSTUM_MARGIN, LARGEST
+
+from tsplat.kernels.camera import (
+    dot,
+    load_camera,
+    load_row,
+    or_ahead,
+    project_point,
+    project_point_backward,
+    stack,
+    store_row,
+    to_camera,
+    transform,
+    transform_transposed,
+)
+from tsplat.kernels.launch import ceil_div, launch, on_device_of
+
+SUMS = 16
+"""Camera gradients of a block of splats: the rows of W | t, then fx, fy, cx, cy."""
+
+
+@triton.jit
+def largest(v):
+    """The largest of |v|, NaN if any is.
+
+    So there is one comparison for all, and no predicate for each, which LLVM would pack into a vector and take through the stack.
+    """
+    result = tl.abs(v[0])
+    for i in tl.static_range(1, len(v)):
+        result = tl.maximum(result, tl.abs(v[i]), propagate_nan=tl.PropagateNan.ALL)
+    return result
+
+
+@triton.jit
+def square(quat):
+    """Squared norm."""
+    return quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3]
+
+
+@triton.jit
+def rotation(quat):
+    """The rotation of a quaternion (w, x, y, z), its unit and 1/norm."""
+    inverse = 1.0 / tl.sqrt(square(quat))
+    w = quat[0] * inverse
+    x = quat[1] * inverse
+    y = quat[2] * inverse
+    z = quat[3] * inverse
+    R = ((1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)),
+         (2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)),
+         (2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)))
+    return R, (w, x, y, z), inverse
+
+
+@triton.jit
+def scale_columns(A, s):
+    """A diag(s)."""
+    return ((A[0][0] * s[0], A[0][1] * s[1], A[0][2] * s[2]), (A[1][0] * s[0], A[1][1] * s[1], A[1][2] * s[2]),
+            (A[2][0] * s[0], A[2][1] * s[1], A[2][2] * s[2]))
+
+
+@triton.jit
+def dot_columns(A, B, j: tl.constexpr):
+    """Inner product of the columns j of two 3 x 3 matrices."""
+    return A[0][j] * B[0][j] + A[1][j] * B[1][j] + A[2][j] * B[2][j]
+
+
+@triton.jit
+def factor_backward(quat, scale, v_F):
+    """Gradients of F = R S with respect to the raw quaternion and the scales."""
+    R, unit, inverse = rotation(quat)
+    v_scale = (dot_columns(v_F, R, 0), dot_columns(v_F, R, 1), dot_columns(v_F, R, 2))
+    r0, r1, r2 = scale_columns(v_F, scale)
+    w, x, y, z = unit
+    v_w = 2.0 * (x * (r2[1] - r1[2]) + y * (r0[2] - r2[0]) + z * (r1[0] - r0[1]))
+    v_x = 2.0 * (-2.0 * x * (r1[1] + r2[2]) + y * (r0[1] + r1[0]) + z * (r0[2] + r2[0]) + w * (r2[1] - r1[2]))
+    v_y = 2.0 * (x * (r0[1] + r1[0]) - 2.0 * y * (r0[0] + r2[2]) + z * (r1[2] + r2[1]) + w * (r0[2] - r2[0]))
+    v_z = 2.0 * (x * (r0[2] + r2[0]) + y * (r1[2] + r2[1]) - 2.0 * z * (r0[0] + r1[1]) + w * (r1[0] - r0[1]))
+    along = w * v_w + x * v_x + y * v_y + z * v_z
+    return ((v_w - w * along) * inverse, (v_x - x * along) * inverse, (v_y - y * along) * inverse, (v_z - z * along) * inverse), v_scale
+
+
+@triton.jit
+def load_quat(quats, n, wanted):
+    """Quaternions; (1, 1, 1, 1) where not wanted."""
+    return load_row(quats + n * 4, wanted, 4, 4, 1.0)
+
+
+@triton.jit
+def load_shape(quats, scales, covars, n, wanted, LARGEST: tl.constexpr):
+    """F with Sigma = F F^T, or Sigma itself if it is given; and whether that is sane: finite, not huge, a rotation, an extent."""
+    if covars is not None:
+        s = load_row(covars + n * 9, wanted, 9, 1)
+        return (s[0:3], s[3:6], s[6:9]), (largest(s) < LARGEST * LARGEST) & (tl.maximum(tl.maximum(s[0], s[4]), s[8]) > 0)
+    else:
+        quat = load_quat(quats, n, wanted)
+        scale = load_row(scales + n * 3, wanted, 3, 1)
+        extent = largest(scale)
+        sane = (largest(quat) < LARGEST) & (square(quat) > 0) & (extent < LARGEST) & (extent > 0)
+        return scale_columns(rotation(quat)[0], scale), sane
+
+
+@triton.jit
+def covariance2d(M, F, HAS_COVARS: tl.constexpr):
+    """T = M F, then xx, xy, yy and the determinant of Sigma' = M Sigma M^T (3DGS, equation 5) without blur."""
+    T0 = transform_transposed(F, M[0])
+    T1 = transform_transposed(F, M[1])
+    if HAS_COVARS:
+        a = dot(T0, M[0])
+        b = dot(T0, M[1])
+        c = dot(T1, M[1])
+        return T0, T1, a, b, c, a * c - b * b
+    else:
+        x = T0[1] * T1[2] - T0[2] * T1[1]
+        y = T0[2] * T1[0] - T0[0] * T1[2]
+        z = T0[0] * T1[1] - T0[1] * T1[0]
+        return T0, T1, dot(T0, T0), dot(T0, T1), dot(T1, T1), x * x + y * y + z * z
+
+
+@triton.jit
+def compensation(det_sharp, det, FLOOR: tl.constexpr):
+    """Ratio of the determinants, and its root, FLOOR at the least."""
+    ratio = det_sharp / det
+    return ratio, tl.sqrt(tl.where(ratio > FLOOR * FLOOR, ratio, FLOOR * FLOOR))
+
+
+@triton.jit
+def half_size(extent, variance):
+    """ceil(extent sigma) in pixels, 2^30 at the most."""
+    return tl.minimum(tl.ceil(extent * tl.sqrt(tl.where(variance < 1e18, variance, 1e18))), 1073741824.0)
+
+
+@triton.jit(do_not_specialize=["N", "C", "width", "height"])
+def project_fwd_kernel(means, quats, scales, covars, opacities, viewmats, Ks, radii, means2d, depths, conics, compensations, N, C, width,
+                       height, near: tl.float64, far: tl.float64, eps2d: tl.float64, MODEL: tl.constexpr, ANTIALIASED: tl.constexpr,
+                       MARGIN: tl.constexpr, FLOOR: tl.constexpr, ALPHA_MIN: tl.constexpr, EXTENT_MAX: tl.constexpr, LARGEST: tl.constexpr,
+                       BLOCK: tl.constexpr):
+    """One camera and one block of splats; the cameras of a block are neighbours, which find its splats in the cache."""
+    camera = (tl.program_id(0) % C).to(tl.int64)
+    n = (tl.program_id(0) // C).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    inside = n < N
+    dt: tl.constexpr = means.dtype.element_ty
+    eps = tl.full((), eps2d, dt)
+    W, t, intrinsics = load_camera(viewmats, Ks, camera)
+    mean = load_row(means + n * 3, inside, 3, 1)
+    p = to_camera(mean, W, t)
+    valid = inside & (largest(mean) < LARGEST) & (p[2] > tl.full((), near, dt)) & (p[2] < tl.full((), far, dt))
+    if MODEL != "orthographic":
+        valid &= p[2] > 0
+    opacity = tl.load(opacities + n, mask=valid, other=0.0)                                 # not even read if culled by depth
+    F, sane = load_shape(quats, scales, covars, n, valid, LARGEST)
+    valid &= sane & (tl.abs(opacity) < float("inf"))
+
+    p = or_ahead(valid, p)
+    u, v, J0, J1 = project_point(p, intrinsics, width, height, MODEL, MARGIN)
+    M = (transform_transposed(W, J0), transform_transposed(W, J1))
+    _, _, a, b, c, det_sharp = covariance2d(M, F, covars is not None)
+    det = det_sharp + eps * (a + c + eps)
+    a += eps
+    c += eps
+    valid &= (det > 0) & (det < float("inf"))
+    det = tl.where(valid, det, 1.0)
+    scaling = tl.full((BLOCK,), 1.0, dt)
+    if ANTIALIASED:
+        scaling = compensation(det_sharp, det, FLOOR)[1]
+        opacity *= scaling
+    # alpha reaches ALPHA_MIN at e standard deviations: e = min(EXTENT_MAX, sqrt(2 ln(o / ALPHA_MIN)))
+    e = tl.sqrt(2.0 * tl.log(tl.where(opacity > ALPHA_MIN, opacity, ALPHA_MIN) / ALPHA_MIN))
+    e = tl.where(e < EXTENT_MAX, e, EXTENT_MAX)
+    rx = half_size(e, tl.where(valid, a, 0.0))
+    ry = half_size(e, tl.where(valid, c, 0.0))
+    valid &= (opacity >= ALPHA_MIN) & (rx > 0) & (ry > 0) & (u + rx > 0) & (u - rx < width) & (v + ry > 0) & (v - ry < height)
+
+    row = camera * N + n
+    inverse = tl.where(valid, 1.0 / det, 0.0)
+    store_row(radii + row * 2, (tl.where(valid, rx, 0.0).to(tl.int32), tl.where(valid, ry, 0.0).to(tl.int32)), inside, 2, 2)
+    store_row(means2d + row * 2, (tl.where(valid, u, 0.0), tl.where(valid, v, 0.0)), inside, 2, 2)
+    tl.store(depths + row, tl.where(valid, p[2], 0.0), mask=inside)
+    store_row(conics + row * 3, (c * inverse, -b * inverse, a * inverse), inside, 3, 1)
+    tl.store(compensations + row, tl.where(valid, scaling, 0.0), mask=inside)
+
+
+@triton.jit
+def load_visible(radii, row, inside):
+    """Whether a pair was not culled."""
+    rx, ry = load_row(radii + row * 2, inside, 2, 2, 0)
+    return (rx > 0) & (ry > 0)
+
+
+@triton.jit
+def combine(a, u, b, v):
+    """a u + b v of 3-vectors."""
+    return a * u[0] + b * v[0], a * u[1] + b * v[1], a * u[2] + b * v[2]
+
+
+@triton.jit
+def add_outer(A, u, v):
+    """A + u v^T."""
+    return combine(1.0, A[0], u[0], v), combine(1.0, A[1], u[1], v), combine(1.0, A[2], u[2], v)
+
+
+@triton.jit(do_not_specialize=["N", "C", "width", "height"])
+def project_bwd_kernel(means, quats, scales, covars, viewmats, Ks, radii, v_means2d, v_depths, v_conics, v_compensations, v_means, v_quats,
+                       v_scales, v_covars, partials, N, C, width, height, eps2d: tl.float64, MODEL: tl.constexpr, ANTIALIASED: tl.constexpr,
+                       MARGIN: tl.constexpr, FLOOR: tl.constexpr, LARGEST: tl.constexpr, SUMS: tl.constexpr, BLOCK: tl.constexpr):
+    """One block of splats, all cameras in turn: sums over cameras in registers, in a fixed order; sums over the block for each camera to
+    `[programs, C, SUMS]`, which torch adds up. No atomics: the same bits in every run.
+
+    Nothing that was culled can do harm: a splat that no camera sees is not read (its shape is 0), the point of a pair that was culled is
+    (0, 0, 1), and what comes from above is 0 for it.
+    """
+    n = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    inside = n < N
+    dt: tl.constexpr = means.dtype.element_ty
+    eps = tl.full((), eps2d, dt)
+    seen = load_visible(radii, n, inside)
+    camera = tl.full((), 1, tl.int64)
+    while camera < C:
+        seen |= load_visible(radii, camera * N + n, inside)
+        camera += 1
+    mean = load_row(means + n * 3, seen, 3, 1)
+    F = load_shape(quats, scales, covars, n, seen, LARGEST)[0]
+    zero = tl.zeros_like(mean[0])
+    v_mean = (zero, zero, zero)
+    v_F = (v_mean, v_mean, v_mean)
+    camera = tl.full((), 0, tl.int64)
+    while camera < C:
+        row = camera * N + n
+        valid = load_visible(radii, row, inside)
+        W, t, intrinsics = load_camera(viewmats, Ks, camera)
+        p = or_ahead(valid, to_camera(mean, W, t))
+        _, _, J0, J1 = project_point(p, intrinsics, width, height, MODEL, MARGIN)
+        M = (transform_transposed(W, J0), transform_transposed(W, J1))
+        T0, T1, a, b, c, det_sharp = covariance2d(M, F, covars is not None)
+        det = tl.where(valid, det_sharp + eps * (a + c + eps), 1.0)
+
+        # conic Q = (A, B, C) of the inverse, so v_Sigma' = -Q v_Q Q; v_b counts both entries off the diagonal
+        v_A, v_B, v_C = load_row(v_conics + row * 3, valid, 3, 1)
+        qa = (c + eps) / det
+        qb = -b / det
+        qc = (a + eps) / det
+        v_a = -(qa * qa * v_A + qa * qb * v_B + qb * qb * v_C)
+        v_b = -(2.0 * qa * qb * v_A + (qa * qc + qb * qb) * v_B + 2.0 * qb * qc * v_C)
+        v_c = -(qb * qb * v_A + qb * qc * v_B + qc * qc * v_C)
+        if ANTIALIASED:
+            ratio, scaling = compensation(det_sharp, det, FLOOR)
+            v_scaling = tl.load(v_compensations + row, mask=valid, other=0.0)
+            v_ratio = tl.where(ratio >= FLOOR * FLOOR, v_scaling / (2.0 * scaling * det), 0.0)         # over det, as the rest
+            v_a += v_ratio * (c - ratio * (c + eps))
+            v_b += v_ratio * 2.0 * b * (ratio - 1.0)
+            v_c += v_ratio * (a - ratio * (a + eps))
+        v_a = tl.where(valid, v_a, 0.0)
+        v_b = tl.where(valid, v_b, 0.0)
+        v_c = tl.where(valid, v_c, 0.0)
+
+        # Sigma' = M Sigma M^T = T T^T
+        v_M0 = combine(2.0 * v_a, T0, v_b, T1)
+        v_M1 = combine(v_b, T0, 2.0 * v_c, T1)
+        if covars is not None:
+            v_F = add_outer(v_F, M[0], combine(v_a, M[0], 0.5 * v_b, M[1]))
+            v_F = add_outer(v_F, M[1], combine(0.5 * v_b, M[0], v_c, M[1]))
+        else:
+            v_F = add_outer(add_outer(v_F, M[0], v_M0), M[1], v_M1)             # so far, v_M0 and v_M1 are v_T0 and v_T1
+            v_M0 = transform(F, v_M0)
+            v_M1 = transform(F, v_M1)
+
+        # M = J W, p = W mean + t
+        v_u, v_v = load_row(v_means2d + row * 2, valid, 2, 2)
+        v_p, v_intrinsics = project_point_backward(p, intrinsics, width, height, v_u, v_v, transform(W, v_M0), transform(W, v_M1), MODEL,
+                                                   MARGIN)
+        v_p = (v_p[0], v_p[1], v_p[2] + tl.load(v_depths + row, mask=valid, other=0.0))
+        v_mean = combine(1.0, v_mean, 1.0, transform_transposed(W, v_p))
+        v_W = (combine(J0[0], v_M0, J1[0], v_M1), combine(J0[1], v_M0, J1[1], v_M1), combine(J0[2], v_M0, J1[2], v_M1))
+        v_W = add_outer(v_W, v_p, mean)
+        sums = tl.sum(stack(v_W[0] + (v_p[0],) + v_W[1] + (v_p[1],) + v_W[2] + (v_p[2],) + v_intrinsics, SUMS), 0)
+        tl.store(partials + (tl.program_id(0).to(tl.int64) * C + camera) * SUMS + tl.arange(0, SUMS), sums)
+        camera += 1
+
+    store_row(v_means + n * 3, v_mean, inside, 3, 1)
+    if covars is not None:
+        store_row(v_covars + n * 9, v_F[0] + v_F[1] + v_F[2], inside, 9, 1)
+    else:
+        v_quat, v_scale = factor_backward(load_quat(quats, n, seen), load_row(scales + n * 3, seen, 3, 1), v_F)
+        store_row(v_quats + n * 4, v_quat, inside, 4, 4)
+        store_row(v_scales + n * 3, v_scale, inside, 3, 1)
+
+
+def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor, viewmats: Tensor,
+            Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float, antialiased: bool
+            ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Launcher; see `tsplat_reference.project`."""
+    C, N = len(viewmats), len(means)
+    radii = means.new_empty(C, N, 2, dtype=torch.int32)
+    means2d, depths, conics, compensations = (means.new_empty(C, N, *s) for s in ((2,), (), (3,), ()))
+    if C * N > 0:
+        block, num_warps = launch("project")
+        with on_device_of(means):
+            project_fwd_kernel[(ceil_div(N, block) * C,)](
+                means.contiguous(), *map(_contiguous, (quats, scales, covars)), opacities.contiguous(), viewmats.contiguous(),
+                Ks.contiguous(), radii, means2d, depths, conics, compensations, N, C, width, height, near, far, eps2d, MODEL=model,
+                ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, ALPHA_MIN=ALPHA_MIN, EXTENT_MAX=EXTENT_MAX,
+                LARGEST=LARGEST, BLOCK=block, num_warps=num_warps, enable_fp_fusion=True)
+    return radii, means2d, depths, conics, compensations
+
+
+def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, viewmats: Tensor, Ks: Tensor,
+                     width: int, height: int, model: str, eps2d: float, antialiased: bool, radii: Tensor, v_means2d: Tensor,
+                     v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor
+                     ) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor | None, Tensor, Tensor]:
+    """Launcher; see `tsplat_reference.project_backward`."""
+    C, N = len(viewmats), len(means)
+    means, viewmats, Ks = means.contiguous(), viewmats.contiguous(), Ks.contiguous()
+    quats, scales, covars = map(_contiguous, (quats, scales, covars))
+    new = torch.empty_like if C * N > 0 else torch.zeros_like
+    v_means, (v_quats, v_scales, v_covars) = new(means), (None if x is None else new(x) for x in (quats, scales, covars))
+    v_viewmats, v_Ks = torch.zeros_like(viewmats), torch.zeros_like(Ks)
+    if C * N > 0:
+        block, num_warps = launch("project_backward")
+        partials = means.new_empty(ceil_div(N, block), C, SUMS)
+        with on_device_of(means):
+            project_bwd_kernel[(len(partials),)](
+                means, quats, scales, covars, viewmats, Ks, radii.contiguous(), v_means2d.contiguous(), v_depths.contiguous(),
+                v_conics.contiguous(), v_compensations.contiguous(), v_means, v_quats, v_scales, v_covars, partials, N, C, width, height,
+                eps2d, MODEL=model, ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, LARGEST=LARGEST, SUMS=SUMS,
+                BLOCK=block, num_warps=num_warps, enable_fp_fusion=True)
+        sums = partials.sum(0)                          # [C, SUMS]
+        v_viewmats[:, :3] = sums[:, :12].view(C, 3, 4)
+        v_Ks.diagonal(0, 1, 2)[:, :2] = sums[:, 12:14]
+        v_Ks[:, :2, 2] = sums[:, 14:]
+    return v_means, v_quats, v_scales, v_covars, v_viewmats, v_Ks
+
+
+def _contiguous(tensor: Tensor | None) -> Tensor | None:
+    return None if tensor is None else tensor.contiguous()

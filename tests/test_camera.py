@@ -182,6 +182,8 @@ WRONG = [
     (ValueError, "camera.model: expected one of pinhole, orthographic, fisheye; got 'panorama'", {"model": "panorama"}),
     (ValueError, "camera.near, camera.far: expected near < far; got 2.0 and 1.0", {"near": 2.0, "far": 1.0}),
     (ValueError, "camera.near, camera.far: expected near < far; got nan", {"near": math.nan}),
+    (TypeError, "camera.near: expected", {"near": "0.1"}),
+    (TypeError, "camera.far: expected", {"far": None}),
 ]
 
 

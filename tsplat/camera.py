@@ -11,7 +11,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from tsplat.checks import check_size, check_tensor
+from tsplat.checks import check_number, check_size, check_tensor
 
 CameraModel = Literal["pinhole", "orthographic", "fisheye"]
 MODELS: tuple[CameraModel, ...] = ("pinhole", "orthographic", "fisheye")
@@ -49,6 +49,8 @@ class Camera:
         check_size("height", self.height)
         if self.model not in MODELS:
             raise ValueError(f"camera.model: expected one of {', '.join(MODELS)}; got {self.model!r}")
+        check_number("camera.near", self.near, "a depth below camera.far")
+        check_number("camera.far", self.far, "a depth above camera.near")
         if not self.near < self.far:
             raise ValueError(f"camera.near, camera.far: expected near < far; got {self.near} and {self.far}")
         check_tensor("camera.viewmats", self.viewmats, (..., 4, 4))

@@ -37,6 +37,12 @@ def check_tensor(name: str, value: object, shape: Sequence[int | str | EllipsisT
         raise ValueError(f"{name}: expected device {like.device}, where the other arguments are; got {value.device}")
 
 
+def check_number(name: str, value: object, expected: str) -> None:
+    """Check that `value` is an int or a float; `expected` says which."""
+    if not isinstance(value, int | float | torch.SymInt | torch.SymFloat) or isinstance(value, bool):
+        raise TypeError(f"{name}: expected {expected}; got {value!r}")
+
+
 def check_size(name: str, value: object) -> None:
     """Check that `value` is an int of at least 1."""
     if not isinstance(value, int | torch.SymInt) or isinstance(value, bool):

@@ -11,7 +11,7 @@ from tsplat_reference.constants import ALPHA_MAX, EPS2D
 
 from tsplat import ops
 from tsplat.camera import Camera
-from tsplat.checks import check_choice, check_size, check_tensor
+from tsplat.checks import check_choice, check_number, check_size, check_tensor
 
 CPU_TILE, GPU_TILE = 8, 16
 """Pixels along the side of a tile. On a CPU 8 beats 4, 6 and 16: smaller tiles have more hits to sort, larger ones more idle pairs."""
@@ -131,7 +131,13 @@ def _check(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities
            screen_offset: Tensor | None, absgrad: Tensor | None, tile: int) -> None:
     """Errors that name the argument, what came and what is expected."""
     check_tensor("means", means, ("N", 3))
+    if means.dtype not in (torch.float32, torch.float64):
+        raise TypeError(f"means: expected dtype torch.float32 or torch.float64, as half precision cannot hold a position; got {means.dtype}")
+    if not isinstance(camera, Camera):
+        raise TypeError(f"camera: expected a tsplat.Camera; got {type(camera).__name__}")
     N, C = means.shape[0], len(camera)
+    if not C:
+        raise ValueError("camera: expected at least 1 camera; got a batch of 0")
     if covars is None:
         check_tensor("quats", quats, (N, 4), like=means)
         check_tensor("scales", scales, (N, 3), like=means)
@@ -140,12 +146,12 @@ def _check(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities
         if quats is not None or scales is not None:
             raise ValueError("covars: expected quats and scales to be None where covars is given")
     check_tensor("opacities", opacities, (N,), like=means)
-    if not isinstance(camera, Camera):
-        raise TypeError(f"camera: expected a tsplat.Camera; got {type(camera).__name__}")
     check_tensor("camera.viewmats", camera.viewmats, (..., 4, 4), like=means)
     if sh_degree is None:
         check_tensor("colors", colors, (N, "D") if getattr(colors, "ndim", 2) < 3 else (C, N, "D"), like=means)
     else:
+        if not isinstance(sh_degree, int) or isinstance(sh_degree, bool):
+            raise TypeError(f"sh_degree: expected an int from 0 to {MAX_DEGREE}; got {sh_degree!r}")
         check_choice("sh_degree", sh_degree, range(MAX_DEGREE + 1))
         check_tensor("colors", colors, (N, f"K >= {(sh_degree + 1) ** 2}", "D"), like=means)
         if colors.shape[1] < (sh_degree + 1) ** 2:
@@ -158,6 +164,8 @@ def _check(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities
         check_tensor("background", background, (D,) if getattr(background, "ndim", 1) < 2 else (C, D), like=means)
     if depth is not None:
         check_choice("depth", depth, ("accumulated", "expected"))
+    check_number("eps2d", eps2d, "a number of at least 0, in pixels squared")
+    check_number("alpha_max", alpha_max, "a number in (0, 1)")
     if not 0 <= eps2d < float("inf"):
         raise ValueError(f"eps2d: expected a number of at least 0, in pixels squared; got {eps2d}")
     if not 0 < alpha_max < 1:

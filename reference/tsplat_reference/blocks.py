@@ -170,10 +170,11 @@ def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Ten
             for tiles, group_image in ordered_map(blend_group, groups):
                 image.index_add_(0, tiles, group_image)
     full = to_image(image, lists.shape, width, height)
-    alphas = full[..., D].contiguous()
-    if backgrounds is None:
-        return full[..., :D].contiguous(), alphas
-    return torch.addcmul(full[..., :D], (1 - alphas)[..., None], backgrounds[:, None, None]), alphas
+    # clones, as an op's results must not share memory, which views of size 1 would
+    rendered, alphas = (x.clone(memory_format=torch.contiguous_format) for x in (full[..., :D], full[..., D]))
+    if backgrounds is not None:
+        rendered.addcmul_((1 - alphas)[..., None], backgrounds[:, None, None])
+    return rendered, alphas
 
 
 def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,

@@ -21,7 +21,7 @@ SERIES_TERMS = 12
 
 def camera_centers(viewmats: Tensor) -> Tensor:
     """World positions `[..., 3]` of the cameras: -R^T t for world-to-camera matrices `[..., 4, 4]`."""
-    return -(viewmats[..., :3, :3].mT @ viewmats[..., :3, 3:]).squeeze(-1)
+    return -(viewmats[..., :3, :3] * viewmats[..., :3, 3:]).sum(-2)                         # no `@`: autocast would round it
 
 
 def split_intrinsics(Ks: Tensor) -> Intrinsics:

@@ -95,12 +95,14 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
     a0, b, c0 = _covariance2d(matmul(J, W), _world_covariance(quats, scales, covars))
     a, c = a0 + eps2d, c0 + eps2d
     det = a * c - b * b
-    ratio = (a0 * c0 - b * b) / torch.where(det > 0, det, 1.0)
+    valid = valid & (det > 0) & det.isfinite()
+    a0, b, c0, a, c, det = (torch.where(valid, v, 1.0) for v in (a0, b, c0, a, c, det))
+    ratio = (a0 * c0 - b * b) / det
 
     compensations = ratio.clamp_min(COMPENSATION_MIN**2).sqrt() if antialiased else torch.ones_like(det)
     rx, ry = _extents(a.detach(), c.detach(), opacities.detach() * compensations.detach())
-    valid = valid & (det > 0) & det.isfinite() & _on_screen(u.detach(), v.detach(), rx, ry, width, height)
-    inverse = torch.where(valid, 1 / torch.where(valid, det, 1.0), 0.0)
+    valid = valid & _on_screen(u.detach(), v.detach(), rx, ry, width, height)
+    inverse = torch.where(valid, 1 / det, 0.0)
     return Projection(
         torch.stack([torch.where(valid, rx, 0.0), torch.where(valid, ry, 0.0)], -1).to(torch.int32),
         torch.stack([torch.where(valid, u, 0.0), torch.where(valid, v, 0.0)], -1),
@@ -138,7 +140,7 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
     p = _or_ahead(valid, _to_camera(split(means), W, viewmats))
     intrinsics = split_intrinsics(Ks)
     _, _, J = project_points(p, intrinsics, width, height, model)
-    M = matmul(J, W)
+    M = [[torch.where(valid, m, 0.0) for m in row] for row in matmul(J, W)]                 # a huge splat may overflow where it is culled
     a0, b, c0 = _covariance2d(M, S)
     a, c = a0 + eps2d, c0 + eps2d
     det = torch.where(valid, a * c - b * b, 1.0)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import torch
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -44,11 +43,8 @@ def target_of(photo: Tensor, background: Tensor, *, masked: bool) -> Target:
 
 def photo_loss(image: Tensor, target: Target, ssim_weight: float) -> Tensor:
     """(1 - w) L1 + w (1 - SSIM) (3DGS, equation 7) of `[H, W, 3]`: a scalar. Pixels that do not count get no gradient."""
-    image = _fill(image, target)
     loss = (1 - ssim_weight) * target.average((image - target.image).abs())
-    if ssim_weight:
-        loss = loss + ssim_weight * (1 - target.average(ssim_map(image, target.image)))
-    return loss
+    return loss + ssim_weight * (1 - ssim(image, target)) if ssim_weight else loss
 
 
 def psnr(image: Tensor, target: Target) -> Tensor:
@@ -57,8 +53,10 @@ def psnr(image: Tensor, target: Target) -> Tensor:
 
 
 def ssim(image: Tensor, target: Target) -> Tensor:
-    """Mean structural similarity over the pixels that count, at most 1."""
-    return target.average(ssim_map(_fill(image, target), target.image))
+    """Mean structural similarity over the pixels that count, at most 1. The others are black in both images."""
+    if target.mask is None:
+        return ssim_map(image, target.image).mean()
+    return target.average(ssim_map(image * target.mask, target.image * target.mask))
 
 
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
@@ -68,8 +66,3 @@ def ssim_map(a: Tensor, b: Tensor) -> Tensor:
     a, b = (pad(image.permute(2, 0, 1)[None], (WINDOW // 2,) * 4) for image in (a, b))          # [1, 3, H + 10, W + 10]
     similarity: Tensor = kornia_ssim(a, b, WINDOW, padding="valid")
     return similarity[0].permute(1, 2, 0)
-
-
-def _fill(image: Tensor, target: Target) -> Tensor:
-    """`image`, with the photo where pixels do not count, so that windows across the border see no difference there."""
-    return image if target.mask is None else torch.lerp(target.image, image, target.mask)

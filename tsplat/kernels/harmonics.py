@@ -220,15 +220,18 @@ def harmonics_bwd_kernel(means, centers, coeffs, mask, v_out, v_means, v_coeffs,
             f = load_coefficients(rows, wanted, USED, D, CHANNELS, CHUNK)
             v_b = f[0:0]
             for k in tl.static_range(USED):
-                value = v[0] * finite(f[k * CHANNELS])
+                value = v[0] * f[k * CHANNELS]
                 for d in tl.static_range(1, CHANNELS):
-                    value += v[d] * finite(f[k * CHANNELS + d])
+                    value += v[d] * f[k * CHANNELS + d]
                 v_b += (value,)
             v_unit = basis_backward(unit[0], unit[1], unit[2], v_b, DEGREE)
             along = dot(unit, v_unit)
-            v_x = (v_unit[0] - unit[0] * along) * inverse
-            v_y = (v_unit[1] - unit[1] * along) * inverse
-            v_z = (v_unit[2] - unit[2] * along) * inverse
+            some = v[0] != 0                            # else 0, also where the coefficients are not finite
+            for d in tl.static_range(1, CHANNELS):
+                some |= v[d] != 0
+            v_x = tl.where(some, (v_unit[0] - unit[0] * along) * inverse, 0.0)
+            v_y = tl.where(some, (v_unit[1] - unit[1] * along) * inverse, 0.0)
+            v_z = tl.where(some, (v_unit[2] - unit[2] * along) * inverse, 0.0)
             v_mean = (v_mean[0] + v_x, v_mean[1] + v_y, v_mean[2] + v_z)
             total = tl.sum(stack((v_x, v_y, v_z, zero), 4), 0)
             row = (tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)).to(tl.int64) * C + camera
@@ -244,11 +247,6 @@ def harmonics_bwd_kernel(means, centers, coeffs, mask, v_out, v_means, v_coeffs,
     if DEGREE > 0:
         store_row(v_means + (tl.program_id(1).to(tl.int64) * N + n) * 3, v_mean, inside, 3, 1)
 
-
-@triton.jit
-def finite(f):
-    """A coefficient that is not finite has no part in the gradient of the direction."""
-    return tl.where(tl.abs(f) < float("inf"), f, 0.0)
 
 
 def harmonics(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:

@@ -184,11 +184,10 @@ def project_fwd_kernel(means, quats, scales, covars, opacities, viewmats, Ks, ra
     valid &= (opacity >= ALPHA_MIN) & (rx > 0) & (ry > 0) & (u + rx > 0) & (u - rx < width) & (v + ry > 0) & (v - ry < height)
 
     row = camera * N + n
-    inverse = tl.where(valid, 1.0 / det, 0.0)
     store_row(radii + row * 2, (tl.where(valid, rx, 0.0).to(tl.int32), tl.where(valid, ry, 0.0).to(tl.int32)), inside, 2, 2)
     store_row(means2d + row * 2, (tl.where(valid, u, 0.0), tl.where(valid, v, 0.0)), inside, 2, 2)
     tl.store(depths + row, tl.where(valid, p[2], 0.0), mask=inside)
-    store_row(conics + row * 3, (c * inverse, -b * inverse, a * inverse), inside, 3, 1)
+    store_row(conics + row * 3, (tl.where(valid, c / det, 0.0), tl.where(valid, -b / det, 0.0), tl.where(valid, a / det, 0.0)), inside, 3, 1)
     tl.store(compensations + row, tl.where(valid, scaling, 0.0), mask=inside)
 
 

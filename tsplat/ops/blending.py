@@ -8,7 +8,7 @@ import tsplat_reference as reference
 from torch import Tensor
 from torch.library import custom_op
 
-from tsplat.ops.common import register_autocast, reject_forward_mode, run_kernel, second_derivative
+from tsplat.ops.common import contiguous, register_autocast, reject_forward_mode, run_kernel, second_derivative
 
 Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
@@ -50,7 +50,7 @@ def _blend_cpu(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tenso
     return reference.blend_blocks(means2d, conics, opacities, colors, backgrounds, *lists)
 
 
-blend_backward_op.register_kernel("cpu")(reference.blend_blocks_backward)
+blend_backward_op.register_kernel("cpu")(contiguous(reference.blend_blocks_backward))
 
 
 @blend_op.register_fake

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -28,6 +29,13 @@ def run_kernel(stage: str, name: str, tensor: Tensor, *args: Any) -> Any:
                                   "install it, or move the tensors to the CPU: .to('cpu')") from None
     with torch.cuda.device(tensor.device) if tensor.is_cuda else contextlib.nullcontext():
         return getattr(kernels, name)(*args)
+
+
+def contiguous(function: Callable[..., tuple[Tensor, ...]]) -> Callable[..., Any]:
+    """Results with the strides that the fake kernels promise, whatever those of the inputs are."""
+    def call(*args: Any) -> Any:
+        return tuple(r.contiguous() for r in function(*args))
+    return functools.wraps(function)(call)
 
 
 def reject_forward_mode(name: str, *tensors: Tensor | None) -> None:
@@ -79,8 +87,8 @@ def second_derivative(function: Callable[..., Sequence[Tensor]], inputs: Sequenc
         leaves = [None if x is None else x.detach().requires_grad_() for x in inputs]
         ups = [v.detach().requires_grad_() for v in cotangents]
         present = [x for x in leaves if x is not None]
-        outputs = function(*leaves)
-        gradients = iter(torch.autograd.grad(outputs, present, ups, create_graph=True, materialize_grads=True))
+        outputs, weights = zip(*((o, v) for o, v in zip(function(*leaves), ups, strict=True) if o.requires_grad), strict=True)
+        gradients = iter(torch.autograd.grad(outputs, present, weights, create_graph=True, materialize_grads=True))
         pairs = [(g, v) for g, v in ((next(gradients), v) for x, v in zip(leaves, v_gradients, strict=True) if x is not None)
                  if v is not None and g.requires_grad]
         if not pairs:

@@ -9,7 +9,7 @@ import tsplat_reference as reference
 from torch import Tensor
 from torch.library import custom_op
 
-from tsplat.ops.common import register_autocast, register_loop_vmap, reject_forward_mode, run_kernel, second_derivative
+from tsplat.ops.common import contiguous, register_autocast, register_loop_vmap, reject_forward_mode, run_kernel, second_derivative
 
 Three = tuple[Tensor, Tensor, Tensor]
 
@@ -35,8 +35,12 @@ def harmonics_backward_op(means: Tensor, centers: Tensor, coeffs: Tensor, degree
     return v_means, v_centers, v_coeffs
 
 
-harmonics_op.register_kernel("cpu")(reference.harmonics)
-harmonics_backward_op.register_kernel("cpu")(reference.harmonics_backward)
+@harmonics_op.register_kernel("cpu")
+def _harmonics_cpu(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:
+    return reference.harmonics(means, centers, coeffs, degree, mask).contiguous()
+
+
+harmonics_backward_op.register_kernel("cpu")(contiguous(reference.harmonics_backward))
 
 
 @harmonics_op.register_fake
@@ -46,7 +50,7 @@ def _harmonics_fake(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int,
 
 @harmonics_backward_op.register_fake
 def _harmonics_backward_fake(means: Tensor, centers: Tensor, coeffs: Tensor, *_: Any) -> Three:
-    return torch.empty_like(means), torch.empty_like(centers), torch.empty_like(coeffs)
+    return means.new_empty(means.shape), centers.new_empty(centers.shape), coeffs.new_empty(coeffs.shape)
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.library import custom_op
 from tsplat_reference import Projection
 
-from tsplat.ops.common import register_autocast, register_loop_vmap, reject_forward_mode, run_kernel, second_derivative
+from tsplat.ops.common import contiguous, register_autocast, register_loop_vmap, reject_forward_mode, run_kernel, second_derivative
 
 Five = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -52,6 +52,7 @@ def _project_cpu(*args: Any) -> Five:
 
 
 @project_backward_op.register_kernel("cpu")
+@contiguous
 def _project_backward_cpu(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
                           viewmats: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float,
                           antialiased: bool, *gradients: Tensor) -> Six:

@@ -239,6 +239,24 @@ def test_forward_mode_is_an_error_not_silence(backend: Backend, name: str) -> No
             call(*(forward_ad.make_dual(x, torch.ones_like(x)) if i == j else x for j, x in enumerate(inputs)))
 
 
+def test_the_forward_mode_error_recommends_what_works(backend: Backend) -> None:
+    """`torch.func` cannot differentiate a custom op (torch 2.13), so the way out is the ordinary backward."""
+    call, inputs = differentiable_case("harmonics", backend)
+    with forward_ad.dual_level(), pytest.raises(NotImplementedError, match="reverse mode") as caught:
+        call(forward_ad.make_dual(inputs[0], torch.ones_like(inputs[0])), *inputs[1:])
+    assert "torch.func" not in str(caught.value)
+
+
+def test_the_absolute_gradient_has_no_derivative_and_says_so(backend: Backend) -> None:
+    """It is a measure for density control; zeros in place of its derivative would be silent nonsense."""
+    _, args = case("blend", backend)
+    args = require_grad(args)
+    image, _ = ops.blend(*args)
+    v_abs, = torch.autograd.grad(image.square().sum(), args[5], create_graph=True)
+    with pytest.raises((NotImplementedError, RuntimeError), match="absgrad|does not require grad"):
+        torch.autograd.grad(v_abs.sum(), args[0])
+
+
 def render(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor, viewmats: Tensor, Ks: Tensor, background: Tensor,
            offset: Tensor, width: int = WIDTH, height: int = HEIGHT) -> tuple[Tensor, Tensor, Tensor]:
     """All stages and options at once."""

@@ -75,7 +75,7 @@ def harmonics(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask:
         return torch.cat(map_chunks(lambda rows: harmonics(means[rows], centers, coeffs[rows], degree, mask[:, rows]),
                                     means.shape[0], CHUNK), 1)
     unit, _ = _directions(means, centers, mask)
-    basis = _monomials(unit, degree) @ _table(degree, unit.dtype, unit.device)[0]           # [C, N, K]
+    basis = _monomials(unit, degree) @ _table(degree, unit)[0]           # [C, N, K]
     return torch.where(mask[..., None], torch.einsum("cnk,nkd->cnd", basis, coeffs[:, :(degree + 1) ** 2]), 0.0)
 
 
@@ -89,7 +89,7 @@ def harmonics_backward(means: Tensor, centers: Tensor, coeffs: Tensor, degree: i
     v_out = torch.where(mask[..., None], v_out, 0.0)
     used = (degree + 1) ** 2
     unit, length = _directions(means, centers, mask)
-    tables = _table(degree, unit.dtype, unit.device)
+    tables = _table(degree, unit)
     basis, *slopes = (_monomials(unit, degree) @ tables.movedim(0, 1).flatten(1)).split(used, -1)  # type: ignore[no-untyped-call]
     v_coeffs = torch.zeros_like(coeffs)
     v_coeffs[:, :used] = torch.einsum("cnk,cnd->nkd", basis, v_out)
@@ -125,18 +125,21 @@ def _monomials(unit: Tensor, degree: int) -> Tensor:
     return torch.stack(list(planes.values())).movedim(0, -1)
 
 
-@functools.cache
-def _table(degree: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+def _table(degree: int, like: Tensor) -> Tensor:
     """`[4, M, (degree + 1)^2]`: the basis, and its derivatives along x, y and z, over the monomials."""
+    return torch.tensor(_entries(degree), dtype=like.dtype, device=like.device)
+
+
+@functools.cache
+def _entries(degree: int) -> list[list[list[float]]]:
+    """Of the table: numbers, as a tensor that was made and cached in inference mode or fake mode would not serve elsewhere."""
     row = {e: i for i, e in enumerate(_exponents(degree))}
-    with torch.inference_mode(False):                       # it stays, and autograd cannot save what was made in inference mode
-        table = torch.zeros(4, len(row), (degree + 1) ** 2, dtype=torch.float64)
+    table = [[[0.0] * (degree + 1) ** 2 for _ in row] for _ in range(4)]
     for column, (constant, polynomial) in enumerate(_BASIS[:(degree + 1) ** 2]):
         for e, factor in polynomial.items():
-            table[0, row[e], column] += constant * factor
+            table[0][row[e]][column] += constant * factor
             for axis in range(3):
                 if e[axis]:
                     lower = e[0] - (axis == 0), e[1] - (axis == 1), e[2] - (axis == 2)
-                    table[1 + axis, row[lower], column] += constant * factor * e[axis]
-    with torch.inference_mode(False):
-        return table.to(dtype=dtype, device=device, copy=True)
+                    table[1 + axis][row[lower]][column] += constant * factor * e[axis]
+    return table

@@ -14,18 +14,18 @@ Make = Callable[..., FitConfig]
 
 
 def test_rate_of_the_means_falls_log_linearly(config: Make) -> None:
-    c = config(steps=101, lr_means=1e-3, lr_means_decay=0.01)
-    rates = [learning_rates(c, 2.0, step)["means"] for step in (0, 50, 100)]
-    factor = math.sqrt(30_000 / 101)
+    c = config(steps=1001, lr_means=1e-3, lr_means_decay=0.01)
+    rates = [learning_rates(c, 2.0, step)["means"] for step in (0, 500, 1000)]
+    factor = math.sqrt(30_000 / 1001)
     assert rates == pytest.approx([2e-3 * factor, 2e-4 * factor, 2e-5 * factor])
-    assert learning_rates(config(steps=1), 2.0, 0)["means"] > 0
+    assert learning_rates(config(steps=1), 1.0, 0)["quats"] == pytest.approx(6 * config(steps=1).lr_quats)      # raised no further
 
 
 def test_schedules_stretch_over_the_steps(config: Make) -> None:
-    short, long = config(steps=401), config(steps=1601)                # 4 times the steps, half the rates
+    short, long = config(steps=1001), config(steps=4001)               # 4 times the steps, half the rates
     for part in range(5):
-        rates = learning_rates(short, 1.0, 100 * part)
-        assert {name: rate / 2 for name, rate in rates.items()} == pytest.approx(learning_rates(long, 1.0, 400 * part), rel=1e-3)
+        rates = learning_rates(short, 1.0, 250 * part)
+        assert {name: rate / 2 for name, rate in rates.items()} == pytest.approx(learning_rates(long, 1.0, 1000 * part), rel=1e-3)
         assert sh_degree_at(config(steps=100), 10 * part) == sh_degree_at(config(steps=1000), 100 * part)
 
 

@@ -11,6 +11,7 @@ from tsplat.scene import Gaussians
 
 EPS = 1e-15                # as in 3DGS: gradients of single splats are tiny
 REFERENCE_STEPS = 30_000   # the length of a fit that the rates of 3DGS, and those of the config, are made for
+MAX_FACTOR = 6.0     # by which fits of fewer steps raise the rates
 
 
 def learning_rates(config: FitConfig, extent: float, step: int) -> dict[str, float]:
@@ -18,7 +19,8 @@ def learning_rates(config: FitConfig, extent: float, step: int) -> dict[str, flo
 
     That of the means falls log-linearly from `lr_means * extent` to that times `lr_means_decay` at the last step
     (3DGS, section 7.1); the others stay. All are the config's times sqrt(30,000 / steps): Adam moves a parameter by about
-    its rate per step, to and fro, so by about rate times sqrt(steps) in all, which stays the same for any number of steps.
+    its rate per step, to and fro, so by about rate times sqrt(steps) in all, which stays the same for any number of steps
+    (down to 830: the factor is 6 at the most, as at 10 fits diverge).
     """
     done = step / max(1, config.steps - 1)
     rates = {
@@ -29,7 +31,7 @@ def learning_rates(config: FitConfig, extent: float, step: int) -> dict[str, flo
         "sh0": config.lr_sh0,
         "sh_rest": config.lr_sh_rest,
     }
-    factor = math.sqrt(REFERENCE_STEPS / max(1, config.steps))
+    factor = min(math.sqrt(REFERENCE_STEPS / max(1, config.steps)), MAX_FACTOR)
     return {name: factor * rate for name, rate in rates.items()}
 
 

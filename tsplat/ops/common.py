@@ -87,8 +87,9 @@ def second_derivative(function: Callable[..., Sequence[Tensor]], inputs: Sequenc
         leaves = [None if x is None else x.detach().requires_grad_() for x in inputs]
         ups = [v.detach().requires_grad_() for v in cotangents]
         present = [x for x in leaves if x is not None]
-        outputs, weights = zip(*((o, v) for o, v in zip(function(*leaves), ups, strict=True) if o.requires_grad), strict=True)
-        gradients = iter(torch.autograd.grad(outputs, present, weights, create_graph=True, materialize_grads=True))
+        outputs = [(o, v) for o, v in zip(function(*leaves), ups, strict=True) if o.requires_grad]
+        gradients = iter(torch.autograd.grad([o for o, _ in outputs], present, [v for _, v in outputs], create_graph=True,
+                                             materialize_grads=True))
         pairs = [(g, v) for g, v in ((next(gradients), v) for x, v in zip(leaves, v_gradients, strict=True) if x is not None)
                  if v is not None and g.requires_grad]
         if not pairs:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import torch
 
@@ -14,34 +12,9 @@ if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")      # read when Triton is imported, which torch.compile does, too
 
 import pytest
-
-from tsplat import Camera
+from backends import BACKENDS, Backend
 
 HERE = Path(__file__).resolve().parent
-
-
-@dataclass(frozen=True)
-class Backend:
-    """Where the ops run, and in which precision their results are compared with `plain.py`."""
-
-    name: str
-    device: torch.device
-    dtype: torch.dtype
-
-    def put(self, value: Any) -> Any:
-        """A tensor, a camera or a tuple of such, on this backend."""
-        if isinstance(value, torch.Tensor):
-            return value.to(self.device, self.dtype if value.is_floating_point() else value.dtype)
-        if isinstance(value, Camera):
-            return value.to(self.device, self.dtype)
-        if isinstance(value, tuple):
-            items = [self.put(v) for v in value]
-            return type(value)(*items) if hasattr(value, "_fields") else tuple(items)
-        return value
-
-
-BACKENDS = {"reference": Backend("reference", torch.device("cpu"), torch.float64)}
-"""Kernels join here: interpreted ones on CPU tensors (`op.set_kernel_enabled("cpu", False)` for each op, in the fixture), CUDA on its own."""
 
 
 @pytest.fixture(params=BACKENDS)
@@ -63,7 +36,8 @@ def shared() -> Path:
 def _same_start(request: pytest.FixtureRequest) -> Iterator[None]:
     """The same seed for every test, whatever ran before, and one thread for those of this folder.
 
-    Their arrays are small, and a second thread would wait in loops; `test_parallel.py` and tests of chunks take more explicitly.
+    Their arrays are small, and a second thread would wait in loops; `test_parallel.py` and tests of chunks take more
+    explicitly.
     """
     torch.manual_seed(0)
     threads = torch.get_num_threads()

@@ -50,13 +50,16 @@ def normal(*shape: int, seed: torch.Generator) -> Tensor:
 
 def splats(n: int, *, seed: int = 0, channels: int = 3, spread: float = 1.5, depth: tuple[float, float] = (2.0, 6.0),
            size: tuple[float, float] = (0.03, 0.5), opacity: tuple[float, float] = (0.05, 0.95)) -> Splats3D:
-    """n anisotropic splats in front of a camera at the origin that looks along z, about half of them partly or wholly out of its view."""
+    """n anisotropic splats in front of a camera at the origin that looks along z, about half of them partly or wholly out of
+    its view.
+    """
     g = generator(seed)
     z = uniform(*depth, n, seed=g)
     xy = uniform(-spread, spread, n, 2, seed=g) * z[:, None] / 2
     quats = normal(n, 4, seed=g) * uniform(0.5, 2.0, n, 1, seed=g)                  # of any length
     scales = uniform(math.log(size[0]), math.log(size[1]), n, 3, seed=g).exp()
-    return Splats3D(torch.cat([xy, z[:, None]], 1), quats, scales, uniform(*opacity, n, seed=g), uniform(0.0, 1.0, n, channels, seed=g))
+    return Splats3D(torch.cat([xy, z[:, None]], 1), quats, scales, uniform(*opacity, n, seed=g),
+                    uniform(0.0, 1.0, n, channels, seed=g))
 
 
 def sh_coefficients(n: int, degree: int, channels: int = 3, *, seed: int = 0) -> Tensor:
@@ -64,9 +67,11 @@ def sh_coefficients(n: int, degree: int, channels: int = 3, *, seed: int = 0) ->
     return normal(n, (degree + 1) ** 2, channels, seed=generator(seed)) * 0.5
 
 
-def camera(count: int | None = None, width: int = 24, height: int = 17, *, model: str = "pinhole", seed: int = 0, near: float = 0.01,
-           far: float = 1e10, turn: float = 0.15) -> Camera:
-    """One camera (count None) or a batch about the origin, slightly turned, with fx != fy and the principal point off the centre."""
+def camera(count: int | None = None, width: int = 24, height: int = 17, *, model: str = "pinhole", seed: int = 0,
+           near: float = 0.01, far: float = 1e10, turn: float = 0.15) -> Camera:
+    """One camera (count None) or a batch about the origin, slightly turned, with fx != fy and the principal point off the
+    centre.
+    """
     g = generator(1000 + seed)
     c = 1 if count is None else count
     axis = normal(c, 3, seed=g) * turn
@@ -84,9 +89,12 @@ def camera(count: int | None = None, width: int = 24, height: int = 17, *, model
     return Camera(viewmats, Ks, width, height, model=model, near=near, far=far)
 
 
-def splats2d(cameras: int, n: int, width: int, height: int, *, seed: int = 0, channels: int = 3, size: tuple[float, float] = (0.4, 4.0),
-             opacity: tuple[float, float] = (0.05, 0.999), shared_colors: bool = False, background: bool = True) -> Splats2D:
-    """Projected splats straight away: log-uniform standard deviations in pixels, any orientation, centres up to a few sizes outside."""
+def splats2d(cameras: int, n: int, width: int, height: int, *, seed: int = 0, channels: int = 3,
+             size: tuple[float, float] = (0.4, 4.0), opacity: tuple[float, float] = (0.05, 0.999), shared_colors: bool = False,
+             background: bool = True) -> Splats2D:
+    """Projected splats straight away: log-uniform standard deviations in pixels, any orientation, centres up to a few sizes
+    outside.
+    """
     g = generator(seed)
     centre = uniform(-0.15, 1.15, cameras, n, 2, seed=g) * torch.tensor([width, height], dtype=torch.float64)
     sd = uniform(math.log(size[0]), math.log(size[1]), cameras, n, 2, seed=g).exp()
@@ -98,4 +106,5 @@ def splats2d(cameras: int, n: int, width: int, height: int, *, seed: int = 0, ch
     radii = (3.33 * torch.diagonal(cov, dim1=-2, dim2=-1).sqrt()).ceil().int()
     return Splats2D(centre, torch.stack([conic[..., 0, 0], conic[..., 0, 1], conic[..., 1, 1]], -1), opacities,
                     uniform(0.0, 1.0, 1 if shared_colors else cameras, n, channels, seed=g),
-                    uniform(0.0, 1.0, cameras, channels, seed=g) if background else None, uniform(1.0, 9.0, cameras, n, seed=g), radii)
+                    uniform(0.0, 1.0, cameras, channels, seed=g) if background else None, uniform(1.0, 9.0, cameras, n, seed=g),
+                    radii)

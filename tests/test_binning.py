@@ -10,7 +10,7 @@ import pytest
 import scenes
 import torch
 import tsplat_reference as reference
-from conftest import Backend
+from backends import Backend
 from torch import Tensor
 from tsplat_reference import constants
 
@@ -39,7 +39,7 @@ def hit_table(s: scenes.Splats2D, width: int, height: int, tile: int) -> Tensor:
     table[owner, result.ids.cpu().long()] = True
     assert table.sum() == len(result.ids)                                        # none twice
     table = table.view(C, tiles_y, tiles_x, C, N)
-    assert not (table & ~torch.eye(C, dtype=torch.bool)[:, None, None, :, None]).any()             # none in another camera's tiles
+    assert not (table & ~torch.eye(C, dtype=torch.bool)[:, None, None, :, None]).any()  # none in another camera's tiles
     return torch.stack([table[c, :, :, c] for c in range(C)])
 
 
@@ -97,11 +97,13 @@ def test_no_pixel_is_lost(size: str, tile: int, dtype: torch.dtype) -> None:
 
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("tile", [4, 5, 8, 16])
-def test_a_tile_is_hit_only_if_the_ellipse_touches_the_rectangle_of_its_pixel_centres(backend: Backend, size: str, tile: int) -> None:
+def test_a_tile_is_hit_only_if_the_ellipse_touches_the_rectangle_of_its_pixel_centres(backend: Backend, size: str,
+                                                                                      tile: int) -> None:
     s = backend.put(splats(size, 0, 61, 47, torch.float64))
     ours = hit_table(s, 61, 47, tile)
     s = scenes.Splats2D(*[x.cpu() for x in s])
-    level = (2 * torch.log(255 * s.opacities)).clamp(max=constants.EXTENT_MAX**2) * (1 + constants.BIN_SLACK_RELATIVE) + constants.BIN_SLACK
+    level = (2 * torch.log(255 * s.opacities)).clamp(max=constants.EXTENT_MAX**2) * (1
+                                                                                     + constants.BIN_SLACK_RELATIVE) + constants.BIN_SLACK
     for c in range(2):
         may = least_distance(s, c, 61, 47, tile) <= level[c] * (1 + 1e-9)
         assert may.sum() < may.numel() or size == "washes"
@@ -115,8 +117,10 @@ def test_a_tile_is_hit_only_if_the_ellipse_touches_the_rectangle_of_its_pixel_ce
 def test_a_splat_hits_no_tile_outside_its_box() -> None:
     cam = scenes.camera(2, 61, 47)
     p = scenes.splats(100)
-    projected = reference.project(p.means, p.quats, p.scales, None, p.opacities, cam.viewmats, cam.Ks, 61, 47, "pinhole", 0.01, 1e10, 0.3, False)
-    s = scenes.Splats2D(projected.means2d, projected.conics, p.opacities.expand(2, -1), p.colors, None, projected.depths, projected.radii)
+    projected = reference.project(p.means, p.quats, p.scales, None, p.opacities, cam.viewmats, cam.Ks, 61, 47, "pinhole", 0.01,
+                                  1e10, 0.3, False)
+    s = scenes.Splats2D(projected.means2d, projected.conics, p.opacities.expand(2, -1), p.colors, None, projected.depths,
+                        projected.radii)
     ours = hit_table(s, 61, 47, 8)
     low, high = s.means2d - s.radii, s.means2d + s.radii
     x, y = torch.arange(8)[None, None, :, None] * 8, torch.arange(6)[None, :, None, None] * 8

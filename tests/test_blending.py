@@ -10,8 +10,8 @@ import pytest
 import scenes
 import torch
 import tsplat_reference as reference
+from backends import Backend
 from compare import assert_close, assert_same_bits, gradients, leaves, strided, threads
-from conftest import Backend
 from torch import Tensor
 from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
@@ -47,8 +47,8 @@ def assert_all_three_agree(s: scenes.Splats2D, width: int, height: int, tile: in
                            backend: Backend | None = None) -> None:
     """Values to 1e-13 and gradients to 1e-11 of the largest.
 
-    The blocks evaluate log alpha as a polynomial about the tile's centre, whose terms reach some hundred: 1e2 eps. The backward divides
-    the rest by the transmittance behind: another 1/(1 - alpha_max).
+    The blocks evaluate log alpha as a polynomial about the tile's centre, whose terms reach some hundred: 1e2 eps. The backward
+    divides the rest by the transmittance behind: another 1/(1 - alpha_max).
     """
     results = []
     for function in (plain.blend, reference.blend, ops.blend):
@@ -65,7 +65,8 @@ def assert_all_three_agree(s: scenes.Splats2D, width: int, height: int, tile: in
 @pytest.mark.parametrize("shared_colors", [False, True])
 @pytest.mark.parametrize("background", [False, True])
 @pytest.mark.parametrize("channels", [1, 3, 17, 130])
-def test_channels_backgrounds_and_shared_colours(backend: Backend, channels: int, background: bool, shared_colors: bool) -> None:
+def test_channels_backgrounds_and_shared_colours(backend: Backend, channels: int, background: bool,
+                                                 shared_colors: bool) -> None:
     s = scenes.splats2d(2, 40, 23, 19, channels=channels, background=background, shared_colors=shared_colors)
     assert_all_three_agree(s, 23, 19, 8, backend=backend)
 
@@ -107,9 +108,12 @@ def test_saturation_within_a_chunk(backend: Backend, alpha_max: float) -> None:
     assert_all_three_agree(s, 12, 12, 8, alpha_max, backend=backend)
 
 
-@pytest.mark.parametrize(("count", "opacity"), [(300, (0.01, 0.3)), (300, (0.3, 1.0)), (64, (0.3, 1.0)), (65, (0.004, 0.02)), (128, (0.1, 0.4))])
+@pytest.mark.parametrize(("count", "opacity"), [(300, (0.01, 0.3)), (300, (0.3, 1.0)), (64, (0.3, 1.0)), (65, (0.004, 0.02)),
+                                                (128, (0.1, 0.4))])
 def test_lists_longer_than_a_chunk(backend: Backend, count: int, opacity: tuple[float, float]) -> None:
-    """The light that a pixel keeps from chunk to chunk, pixels that end in the second chunk, and lists that end with a chunk."""
+    """The light that a pixel keeps from chunk to chunk, pixels that end in the second chunk, and lists that end with a
+    chunk.
+    """
     s = scenes.splats2d(1, count, 10, 9, size=(3.0, 20.0), opacity=opacity)
     assert lists(s, 10, 9, 8).offsets.diff().max() > 0.8 * count >= 0.8 * blocks.CHUNK
     assert_all_three_agree(s, 10, 9, 8, backend=backend)
@@ -118,8 +122,8 @@ def test_lists_longer_than_a_chunk(backend: Backend, count: int, opacity: tuple[
 @pytest.mark.parametrize(("chunk", "block", "group", "group_tiles"), [(1, 1, 1, 1), (7, 1 << 10, 64, 3), (64, 1, 1 << 15, 128),
                                                                       (1000, 1 << 18, 1 << 15, 1)])
 @pytest.mark.parametrize("channels", [3, 20])
-def test_chunks_blocks_and_groups_change_nothing(monkeypatch: pytest.MonkeyPatch, channels: int, chunk: int, block: int, group: int,
-                                                 group_tiles: int) -> None:
+def test_chunks_blocks_and_groups_change_nothing(monkeypatch: pytest.MonkeyPatch, channels: int, chunk: int, block: int,
+                                                 group: int, group_tiles: int) -> None:
     s, inputs = differentiable(scenes.splats2d(2, 25, 13, 11, channels=channels, size=(0.5, 9.0), opacity=(0.05, 1.0)))
     probe = torch.zeros_like(s.means2d).requires_grad_()
     bins = lists(s, 13, 11, 8)
@@ -150,14 +154,16 @@ def stack(opacities: Sequence[float], colors: Sequence[float]) -> scenes.Splats2
     n = len(opacities)
     f64 = {"dtype": torch.float64}
     return scenes.Splats2D(torch.full((1, n, 2), 0.5, **f64), torch.tensor([1e-2, 0.0, 1e-2], **f64).expand(1, n, 3),
-                           torch.tensor([opacities], **f64), torch.tensor(colors, **f64)[None, :, None], torch.zeros(1, 1, **f64),
-                           torch.arange(n, **f64)[None] + 1, torch.full((1, n, 2), 40, dtype=torch.int32))
+                           torch.tensor([opacities], **f64), torch.tensor(colors, **f64)[None, :, None],
+                           torch.zeros(1, 1, **f64), torch.arange(n, **f64)[None] + 1,
+                           torch.full((1, n, 2), 40, dtype=torch.int32))
 
 
 @pytest.mark.parametrize("function", [ops.blend, reference.blend, plain.blend])
 @pytest.mark.parametrize(("front", "counts"), [(1.001e-4, True), (0.999e-4, False)])
 @pytest.mark.parametrize("behind", [4, 70, 130])
-def test_a_splat_counts_while_the_light_in_front_of_it_is_above_the_limit(function: Callable[..., Any], front: float, counts: bool,
+def test_a_splat_counts_while_the_light_in_front_of_it_is_above_the_limit(function: Callable[..., Any], front: float,
+                                                                          counts: bool,
                                                                            behind: int) -> None:
     """Whether the deciding splat is in the first chunk or in a later one; nothing behind it counts, however bright."""
     faint = behind - 4
@@ -172,7 +178,8 @@ def test_a_splat_counts_while_the_light_in_front_of_it_is_above_the_limit(functi
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_what_the_stop_leaves_out_weighs_at_most_its_limit(backend: Backend, monkeypatch: pytest.MonkeyPatch, seed: int) -> None:
+def test_what_the_stop_leaves_out_weighs_at_most_its_limit(backend: Backend, monkeypatch: pytest.MonkeyPatch,
+                                                           seed: int) -> None:
     s = scenes.splats2d(1, 200, 16, 16, seed=seed, size=(2.0, 9.0), opacity=(0.3, 1.0), background=False)
     image, alpha = blend(ops.blend, backend.put(s), 16, 16, 8)
     monkeypatch.setattr(plain, "STOP", -1.0)
@@ -218,7 +225,8 @@ def test_below_one_part_in_255_there_is_nothing(backend: Backend) -> None:
 
 @pytest.mark.parametrize("background", [False, True])
 @pytest.mark.parametrize("shared_colors", [False, True])
-def test_absolute_gradient_is_the_sum_over_pixels_of_magnitudes(backend: Backend, background: bool, shared_colors: bool) -> None:
+def test_absolute_gradient_is_the_sum_over_pixels_of_magnitudes(backend: Backend, background: bool,
+                                                                shared_colors: bool) -> None:
     s = scenes.splats2d(2, 40, 23, 19, background=background, shared_colors=shared_colors, opacity=(0.05, 1.0))
     v_image, v_alpha = scenes.normal(2, 19, 23, 3, seed=scenes.generator(1)), scenes.normal(2, 19, 23, seed=scenes.generator(2))
     want = plain.absolute_gradient(*s, 23, 19, v_image, v_alpha)
@@ -270,7 +278,8 @@ def test_the_order_of_the_splats_in_memory_does_not_matter(backend: Backend) -> 
         results.append((outputs, gradients(outputs, inputs)))
     (want, v_want), (got, v_got) = results
     assert_same_bits(got, want)
-    assert_close(v_got, [v if v.ndim == 2 and v.shape[1] == 3 else v[:, order] for v in v_want], 1e-14)   # summed over tiles in their order
+    # summed over tiles in their order
+    assert_close(v_got, [v if v.ndim == 2 and v.shape[1] == 3 else v[:, order] for v in v_want], 1e-14)
 
 
 def test_layout_of_inputs_and_upstream_gradients_does_not_matter(backend: Backend) -> None:
@@ -285,13 +294,16 @@ def test_layout_of_inputs_and_upstream_gradients_does_not_matter(backend: Backen
 
 @pytest.mark.parametrize("tile", [4, 8, 16])
 def test_float32_stays_within_its_rounding_errors(tile: int) -> None:
-    """|d log alpha| is eps times the terms of the polynomial, and |dC| <= 2 max|c| |d log alpha|, as sum_i |dC/dlog alpha_i| <= 2 max|c|.
+    """|d log alpha| is eps times the terms of the polynomial, and |dC| <= 2 max|c| |d log alpha|, as sum_i |dC/dlog alpha_i| <=
+    2 max|c|.
 
-    Products and sums along a list of n splats add n eps. Pixels where a decision (1/255, the stop) is as close as that may flip it.
+    Products and sums along a list of n splats add n eps. Pixels where a decision (1/255, the stop) is as close as that may flip
+    it.
     """
     s64 = scenes.splats2d(1, 200, 40, 32, size=(0.6, 9.0), background=False)
     s32, inputs32 = differentiable(scenes.Splats2D(*[x.float() if x is not None and x.is_floating_point() else x for x in s64]))
-    s64, inputs64 = differentiable(scenes.Splats2D(*[x.double() if x is not None and x.is_floating_point() else x for x in s32]))
+    s64, inputs64 = differentiable(scenes.Splats2D(*[x.double() if x is not None and x.is_floating_point() else x
+                                                     for x in s32]))
     ids, offsets = lists(s64, 40, 32, tile)
     eps = torch.finfo(torch.float32).eps
     owner = torch.repeat_interleave(offsets.diff())
@@ -315,7 +327,8 @@ def test_float32_stays_within_its_rounding_errors(tile: int) -> None:
         difference = (g - w).abs()[0]
         assert difference[~close].max() <= 2 * error
         assert difference.max() <= 2 * error + 1 / 255
-    # dL/dlog alpha_i = w_i (g_i - R_i/T_{i+1}), R by subtraction from a sum: eps / (1 - alpha_max) of the largest, times the terms above
+    # dL/dlog alpha_i = w_i (g_i - R_i/T_{i+1}), R by subtraction from a sum: eps / (1 - alpha_max) of the largest, times the
+    # terms above
     calm = (~close).float()[None]
     v32, v64 = (torch.autograd.grad([(image * calm[..., None]).sum() + (alpha * calm).sum()], inputs)
                 for (image, alpha), inputs in ((got, inputs32), (want, inputs64)))
@@ -357,7 +370,8 @@ def peaks(n: int, side: int) -> tuple[int, int]:
 
 
 def test_working_memory_does_not_grow_with_the_pairs_of_pixels_and_splats(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Some numbers for each splat, for each pixel and channel, and constants; here with small constants, and every splat on every pixel.
+    """Some numbers for each splat, for each pixel and channel, and constants; here with small constants, and every splat on
+    every pixel.
 
     Measured 14 numbers for each splat and each pixel in the forward, 27 and 13 in the backward.
     """
@@ -365,7 +379,7 @@ def test_working_memory_does_not_grow_with_the_pairs_of_pixels_and_splats(monkey
     constants = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "GROUP_TILES": 1}
     for name, value in constants.items():
         monkeypatch.setattr(blocks, name, value)
-    for n, side in ((100, 24), (400, 24), (100, 48)):                             # of which each but the first has four times the pairs
+    for n, side in ((100, 24), (400, 24), (100, 48)):  # of which each but the first has four times the pairs
         allowed = 30 * n + 16 * side * side + 5 * constants["BLOCK"] + 100 * constants["GROUP"]
         assert max(peaks(n, side)) < allowed
         assert min(by_default) > 4 * allowed                                      # the measure does see the working memory

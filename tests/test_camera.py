@@ -38,7 +38,8 @@ def definition(p: torch.Tensor, K: torch.Tensor, model: str) -> tuple[torch.Tens
 
 def as_matrix(J: list[list[torch.Tensor | float]], like: torch.Tensor) -> torch.Tensor:
     """`[n, 2, 3]` from planes `[1, n]` or zeros."""
-    return torch.stack([torch.stack([torch.as_tensor(v, dtype=like.dtype).expand_as(like) for v in row], -1) for row in J], -2)[0]
+    return torch.stack([torch.stack([torch.as_tensor(v, dtype=like.dtype).expand_as(like) for v in row], -1) for row in J],
+                       -2)[0]
 
 
 @pytest.mark.parametrize("model", MODELS)
@@ -72,10 +73,12 @@ def exact_fisheye(axis: int, x: mpmath.mpf, y: mpmath.mpf, z: mpmath.mpf) -> mpm
     return (x, y)[axis] * (mpmath.atan2(r, z) / r if r else 1 / z)
 
 
-@pytest.mark.parametrize("r", [0.0, 1e-12, 1e-6, 1e-3, 0.1, math.sqrt(SERIES_BELOW) * (1 - 1e-9), math.sqrt(SERIES_BELOW) * (1 + 1e-9), 0.5, 3.0,
-                               40.0])
+@pytest.mark.parametrize("r", [0.0, 1e-12, 1e-6, 1e-3, 0.1, math.sqrt(SERIES_BELOW) * (1 - 1e-9),
+                               math.sqrt(SERIES_BELOW) * (1 + 1e-9), 0.5, 3.0, 40.0])
 def test_fisheye_is_exact_from_the_axis_to_the_rim(r: float) -> None:
-    """Series and closed form meet at r/z = sqrt(SERIES_BELOW); both sides are held against 40 digits, second derivatives included."""
+    """Series and closed form meet at r/z = sqrt(SERIES_BELOW); both sides are held against 40 digits, second derivatives
+    included.
+    """
     at = (0.6 * r, -0.8 * r, 1.0)
     p = f64(at)[:, None, None]
     K = torch.eye(3, dtype=torch.float64)[None]
@@ -85,7 +88,8 @@ def test_fisheye_is_exact_from_the_axis_to_the_rim(r: float) -> None:
         pixels = [float(exact_fisheye(i, *map(mpmath.mpf, at))) for i in range(2)]
         orders = [tuple(int(i == j) for j in range(3)) for i in range(3)]
         jacobian = [[float(mpmath.diff(lambda *q, i=i: exact_fisheye(i, *q), at, o)) for o in orders] for i in range(2)]
-        second = [[[float(mpmath.diff(lambda *q, i=i: exact_fisheye(i, *q), at, tuple(map(sum, zip(o, a, strict=True))))) for a in orders]
+        second = [[[float(mpmath.diff(lambda *q, i=i: exact_fisheye(i, *q), at, tuple(map(sum, zip(o, a, strict=True)))))
+                    for a in orders]
                    for o in orders] for i in range(2)]
     # rounding of s, k and m is multiplied by 1/t and 1/t^2, t = (r/z)^2 >= 0.05, and by x^2 and x^2 y again: 20 to 100 eps
     assert_close(torch.stack([u, v]).flatten(), f64(pixels), 2e-15)
@@ -167,7 +171,8 @@ WRONG = [
     (ValueError, "camera.viewmats: expected shape [..., 4, 4]; got [3, 4]", {"viewmats": EYE4[:3]}),
     (ValueError, "camera.viewmats: expected shape [..., 4, 4]; got [4]", {"viewmats": EYE4[0]}),
     (ValueError, "camera.Ks: expected shape [..., 3, 3]; got [4, 4]", {"Ks": EYE4}),
-    (TypeError, "camera.Ks: expected dtype torch.float32, as the other arguments have; got torch.float64", {"Ks": EYE3.double()}),
+    (TypeError, "camera.Ks: expected dtype torch.float32, as the other arguments have; got torch.float64",
+     {"Ks": EYE3.double()}),
     (ValueError, "camera.Ks: expected device cpu, where the other arguments are; got meta", {"Ks": EYE3.to("meta")}),
     (ValueError, "expected [C, 4, 4] and [C, 3, 3], or [4, 4] and [3, 3]; got [4, 4] and [1, 3, 3]", {"Ks": EYE3[None]}),
     (ValueError, "expected [C, 4, 4] and [C, 3, 3], or [4, 4] and [3, 3]; got [2, 4, 4] and [3, 3, 3]",
@@ -188,7 +193,8 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("kind", "message", "changes"), WRONG, ids=[m[1][:50] for m in WRONG])
-def test_errors_name_the_argument_what_came_and_what_is_expected(kind: type[Exception], message: str, changes: dict[str, object]) -> None:
+def test_errors_name_the_argument_what_came_and_what_is_expected(kind: type[Exception], message: str,
+                                                                 changes: dict[str, object]) -> None:
     arguments = {"viewmats": EYE4, "Ks": EYE3, "width": 24, "height": 17} | changes
     with pytest.raises(kind, match=re.escape(message)):
         Camera(**arguments)

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import scenes
 import torch
+from backends import Backend
 from compare import assert_close, assert_same_bits, gradients, leaves
-from conftest import Backend
 from torch import Tensor
 
 from tsplat import Camera, ops, rasterize
@@ -18,12 +18,13 @@ NAN, INF = math.nan, math.inf
 MEANS, QUATS, SCALES, OPACITIES, COLORS = range(5)
 BROKEN: dict[str, tuple[int, Any]] = {
     "mean NaN": (MEANS, [NAN, 0.0, 3.0]), "mean infinite": (MEANS, [0.0, INF, 3.0]), "depth infinite": (MEANS, [0.0, 0.0, INF]),
-    "depth minus infinity": (MEANS, [0.0, 0.0, -INF]), "mean beyond all": (MEANS, [0.0, 0.0, 1e30]), "mean at the camera": (MEANS, None),
-    "quaternion NaN": (QUATS, [1.0, 0.0, NAN, 0.0]), "quaternion zero": (QUATS, [0.0, 0.0, 0.0, 0.0]),
-    "quaternion infinite": (QUATS, [1.0, INF, 0.0, 0.0]), "quaternion huge": (QUATS, [1e30, 0.0, 0.0, 1e30]),
-    "scales zero": (SCALES, [0.0, 0.0, 0.0]), "scale NaN": (SCALES, [NAN, 0.1, 0.1]), "scale infinite": (SCALES, [0.1, 0.1, INF]),
-    "scale 1e30": (SCALES, [1e30, 0.1, 0.1]), "scales 1e30": (SCALES, [1e30, 1e30, 1e30]),
-    "opacity NaN": (OPACITIES, NAN), "opacity infinite": (OPACITIES, INF), "opacity negative": (OPACITIES, -1.0), "opacity zero": (OPACITIES, 0.0),
+    "depth minus infinity": (MEANS, [0.0, 0.0, -INF]), "mean beyond all": (MEANS, [0.0, 0.0, 1e30]),
+    "mean at the camera": (MEANS, None), "quaternion NaN": (QUATS, [1.0, 0.0, NAN, 0.0]),
+    "quaternion zero": (QUATS, [0.0, 0.0, 0.0, 0.0]), "quaternion infinite": (QUATS, [1.0, INF, 0.0, 0.0]),
+    "quaternion huge": (QUATS, [1e30, 0.0, 0.0, 1e30]), "scales zero": (SCALES, [0.0, 0.0, 0.0]),
+    "scale NaN": (SCALES, [NAN, 0.1, 0.1]), "scale infinite": (SCALES, [0.1, 0.1, INF]),
+    "scale 1e30": (SCALES, [1e30, 0.1, 0.1]), "scales 1e30": (SCALES, [1e30, 1e30, 1e30]), "opacity NaN": (OPACITIES, NAN),
+    "opacity infinite": (OPACITIES, INF), "opacity negative": (OPACITIES, -1.0), "opacity zero": (OPACITIES, 0.0),
     "SH NaN": (COLORS, NAN), "SH infinite": (COLORS, INF), "SH minus infinity": (COLORS, -INF),
 }
 BAD = 5                                                                           # its index
@@ -90,8 +91,8 @@ def test_degenerate_covariances(what: str) -> None:
         means = s.means.clone()
         means[BAD] = torch.tensor([0.1, 0.1, 3.0 if broken else -3.0])
         if broken:
-            covars[BAD] = {"NaN": covars[BAD] * NAN, "infinite": covars[BAD] + INF, "zero": covars[BAD] * 0, "beyond all": covars[BAD] * 1e40,
-                           "not symmetric to the least": -covars[BAD]}[what]
+            covars[BAD] = {"NaN": covars[BAD] * NAN, "infinite": covars[BAD] + INF, "zero": covars[BAD] * 0,
+                           "beyond all": covars[BAD] * 1e40, "not symmetric to the least": -covars[BAD]}[what]
         inputs = leaves(means, covars, s.opacities, s.colors)
         r = rasterize(inputs[0], None, None, *inputs[2:], cam, covars=inputs[1])
         assert not r.meta.visible[0, BAD]
@@ -130,7 +131,8 @@ def test_a_splat_hidden_by_its_colour_in_one_camera_is_seen_by_the_other(backend
 @pytest.mark.parametrize("covariances", [False, True])
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("count", [0, 4])
-def test_nothing_to_see_is_the_background_and_differentiates_to_zeros(backend: Backend, count: int, antialiased: bool, covariances: bool) -> None:
+def test_nothing_to_see_is_the_background_and_differentiates_to_zeros(backend: Backend, count: int, antialiased: bool,
+                                                                      covariances: bool) -> None:
     """N = 0, or all splats behind the camera; the first and second derivatives exist."""
     s, cam = backend.put((scenes.splats(count), scenes.camera(2)))
     means = s.means * torch.tensor([1.0, 1.0, -1.0], dtype=backend.dtype, device=backend.device)

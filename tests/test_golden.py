@@ -1,8 +1,10 @@
-"""Against recorded results of gsplat's reference (float64, rounded to float32 in the file), of gsplat on CUDA, and real trained scenes.
+"""Against recorded results of gsplat's reference (float64, rounded to float32 in the file), of gsplat on CUDA, and real trained
+scenes.
 
-Where a pixel saturates gsplat drops the splat that takes the light below 1e-4, and tsplat keeps it (see `reference.blend`). That splat
-weighs up to 1e-4 alpha_max / (1 - alpha_max) = 9.9e-3, so there the two must differ. `plain.py` has both rules: with the peers' it gives
-the recorded numbers everywhere, gradients included; with ours it is what the other tests hold tsplat against.
+Where a pixel saturates gsplat drops the splat that takes the light below 1e-4, and tsplat keeps it (see `reference.blend`).
+That splat weighs up to 1e-4 alpha_max / (1 - alpha_max) = 9.9e-3, so there the two must differ. `plain.py` has both rules: with
+the peers' it gives the recorded numbers everywhere, gradients included; with ours it is what the other tests hold tsplat
+against.
 """
 
 from __future__ import annotations
@@ -18,8 +20,8 @@ import plain
 import pytest
 import torch
 import tsplat_reference as reference
+from backends import Backend
 from compare import assert_close, error, leaves
-from conftest import Backend
 from torch import Tensor
 
 from tsplat import Camera, Gaussians, ops, rasterize
@@ -81,7 +83,8 @@ def ours(golden: Golden, backend: Backend) -> tuple[Tensor, Tensor, list[Tensor]
     """Image, alpha, leaves, zero screen offset and probe of the absolute gradient, through `rasterize`."""
     inputs = leaves(*(backend.put(golden[name]) for name in INPUTS))
     *splats, viewmats, Ks, background = inputs
-    offset, probe = (torch.zeros(len(viewmats), len(splats[0]), 2, dtype=backend.dtype, device=backend.device, requires_grad=True)
+    offset, probe = (torch.zeros(len(viewmats), len(splats[0]), 2, dtype=backend.dtype, device=backend.device,
+                                 requires_grad=True)
                      for _ in range(2))
     r = rasterize(*splats, Camera(viewmats, Ks, golden.width, golden.height), background=background, depth=golden.depth,
                   eps2d=golden.eps2d, alpha_max=golden.alpha_max, screen_offset=offset, absgrad=probe)
@@ -93,8 +96,9 @@ def plainly(golden: Golden, drop_last: bool) -> tuple[Tensor, Tensor, list[Tenso
     inputs = leaves(*(golden[name] for name in INPUTS))
     *splats, viewmats, Ks, background = inputs
     offset = torch.zeros(len(viewmats), len(splats[0]), 2, dtype=torch.float64, requires_grad=True)
-    image, alpha, depth = plain.render(*splats, viewmats, Ks, golden.width, golden.height, background=background, depth=golden.depth,
-                                       eps2d=golden.eps2d, alpha_max=golden.alpha_max, screen_offset=offset, drop_last=drop_last)
+    image, alpha, depth = plain.render(*splats, viewmats, Ks, golden.width, golden.height, background=background,
+                                       depth=golden.depth, eps2d=golden.eps2d, alpha_max=golden.alpha_max, screen_offset=offset,
+                                       drop_last=drop_last)
     return channels(image, depth), alpha, inputs, offset
 
 
@@ -112,7 +116,9 @@ def gradients_of(loss: Tensor, inputs: list[Tensor], offset: Tensor) -> list[Ten
 
 @functools.cache
 def peers(golden: Golden) -> tuple[Tensor, Tensor, list[Tensor], list[Tensor]]:
-    """Image and alpha of `plain` with the peers' rule, and the gradients of the recorded loss: of all pixels, and of the calm ones."""
+    """Image and alpha of `plain` with the peers' rule, and the gradients of the recorded loss: of all pixels, and of the calm
+    ones.
+    """
     image, alpha, inputs, offset = plainly(golden, drop_last=True)
     losses = recorded_loss(golden, image, alpha), recorded_loss(golden, image, alpha, golden.calm)
     return image.detach(), alpha.detach(), *(gradients_of(loss, inputs, offset) for loss in losses)
@@ -143,7 +149,9 @@ def test_the_plain_formulation_with_the_peers_stop_is_the_recording(golden: Gold
 
 
 def test_gradients_from_pixels_that_do_not_saturate_are_the_peers(golden: Golden, backend: Backend) -> None:
-    """Asked for: 1e-5 of the largest. The file's own gradients mix saturated pixels in; the loss here leaves them out on both sides."""
+    """Asked for: 1e-5 of the largest. The file's own gradients mix saturated pixels in; the loss here leaves them out on both
+    sides.
+    """
     image, alpha, inputs, offset, _ = ours(golden, backend)
     assert_close(gradients_of(recorded_loss(golden, image, alpha, golden.calm), inputs, offset), peers(golden)[3], 1e-12)
 
@@ -151,8 +159,8 @@ def test_gradients_from_pixels_that_do_not_saturate_are_the_peers(golden: Golden
 def test_gradients_are_the_recorded_ones(golden: Golden, backend: Backend) -> None:
     """All pixels: to rounding where none saturates; else off by the splats that the peers drop.
 
-    Measured on the anisotropic scene, 324 of 16,640 pixels saturated: means 1.2e-3, quats 1.0e-3, scales 1.4e-3, opacities 1.1e-2, colors
-    5.8e-4, viewmats 6.7e-4, backgrounds 2.8e-3, means2d 1.6e-3 of the largest.
+    Measured on the anisotropic scene, 324 of 16,640 pixels saturated: means 1.2e-3, quats 1.0e-3, scales 1.4e-3, opacities
+    1.1e-2, colors 5.8e-4, viewmats 6.7e-4, backgrounds 2.8e-3, means2d 1.6e-3 of the largest.
     """
     image, alpha, inputs, offset, _ = ours(golden, backend)
     names = (*WITH_GRADIENT, "means2d")
@@ -166,7 +174,8 @@ def test_where_pixels_saturate_we_are_closer_to_the_exact_sum_than_the_peers(gol
                                                                             monkeypatch: pytest.MonkeyPatch) -> None:
     """Ours within 1e-4 of the sum over all splats; the peers up to 9.9e-3 off, and so is the difference of the two.
 
-    Measured: 7.0e-3 in the image, 9.2e-3 in alpha. (Asked for was 1.5e-4, which no rule that is within 1e-4 of the exact sum can meet.)
+    Measured: 7.0e-3 in the image, 9.2e-3 in alpha. (Asked for was 1.5e-4, which no rule that is within 1e-4 of the exact sum
+    can meet.)
     """
     image, alpha, *_ = ours(golden, backend)
     with torch.no_grad():
@@ -193,9 +202,12 @@ def test_absolute_gradients_are_the_recorded_ones(golden: Golden, backend: Backe
 
 
 def test_projection_is_the_recorded_one(golden: Golden, backend: Backend) -> None:
-    """The intermediates were recorded in float32, with its rounding errors: in the conics 6e-6 of the largest where they are thin."""
+    """The intermediates were recorded in float32, with its rounding errors: in the conics 6e-6 of the largest where they are
+    thin.
+    """
     args = [backend.put(golden[name]) for name in INPUTS]
-    got = ops.project(*args[:3], None, args[3], args[5], args[6], golden.width, golden.height, "pinhole", 0.01, 1e10, golden.eps2d, False)
+    got = ops.project(*args[:3], None, args[3], args[5], args[6], golden.width, golden.height, "pinhole", 0.01, 1e10,
+                      golden.eps2d, False)
     assert torch.equal(got.radii.cpu(), golden["radii_opacity_aware"])
     visible = (got.radii > 0).all(-1).cpu()
     for name, tolerance in (("means2d", 1.3e-7), ("depths", 7e-8), ("conics", 7e-6)):
@@ -207,12 +219,14 @@ def test_gradients_of_the_intermediates_are_the_recorded_ones(shared: Path, back
     """Of conics, depths, and opacities and colours of each view, in the scenes in which nothing saturates."""
     golden = load(shared / "golden" / "gsplat" / "random_batch2x3_rgbed.npz", index)
     args = [backend.put(golden[name]) for name in INPUTS]
-    p = ops.project(*args[:3], None, args[3], args[5], args[6], golden.width, golden.height, "pinhole", 0.01, 1e10, golden.eps2d, False)
-    means2d, conics, depths, opacities, colors = leaves(p.means2d, p.conics, p.depths, args[3].expand(3, -1), args[4].expand(3, -1, -1))
+    p = ops.project(*args[:3], None, args[3], args[5], args[6], golden.width, golden.height, "pinhole", 0.01, 1e10,
+                    golden.eps2d, False)
+    means2d, conics, depths, opacities, colors = leaves(p.means2d, p.conics, p.depths, args[3].expand(3, -1),
+                                                        args[4].expand(3, -1, -1))
     bins = ops.bin_splats(means2d, p.radii, conics, opacities, depths, golden.width, golden.height, 8)
     background = torch.cat([args[7], torch.zeros_like(args[7][:, :1])], 1)
-    image, alpha = ops.blend(means2d, conics, opacities, torch.cat([colors, depths[..., None]], -1), background, None, *bins, golden.width,
-                             golden.height, 8, golden.alpha_max)
+    image, alpha = ops.blend(means2d, conics, opacities, torch.cat([colors, depths[..., None]], -1), background, None, *bins,
+                             golden.width, golden.height, 8, golden.alpha_max)
     image = torch.cat([image[..., :3], image[..., 3:] / alpha[..., None].clamp_min(1e-10)], -1)
     found = torch.autograd.grad(recorded_loss(golden, image, alpha), [means2d, conics, depths, opacities, colors])
     names = "means2d", "conics", "depths", "opacities_view", "colors_view"
@@ -220,9 +234,12 @@ def test_gradients_of_the_intermediates_are_the_recorded_ones(shared: Path, back
 
 
 def test_tiles_are_between_the_exact_ones_and_those_of_the_accurate_rule(golden: Golden, backend: Backend) -> None:
-    """Exact <= ours <= AccuTile <= box for each splat; in all 3,070 against 3,066 and 3,216 on the anisotropic scene, else the exact ones."""
+    """Exact <= ours <= AccuTile <= box for each splat; in all 3,070 against 3,066 and 3,216 on the anisotropic scene, else the
+    exact ones.
+    """
     args = [backend.put(golden[name]) for name in INPUTS]
-    p = ops.project(*args[:3], None, args[3], args[5], args[6], golden.width, golden.height, "pinhole", 0.01, 1e10, golden.eps2d, False)
+    p = ops.project(*args[:3], None, args[3], args[5], args[6], golden.width, golden.height, "pinhole", 0.01, 1e10,
+                    golden.eps2d, False)
     C, N = p.depths.shape
     bins = ops.bin_splats(p.means2d, p.radii, p.conics, args[3].expand(C, -1), p.depths, golden.width, golden.height, 16)
     count = torch.bincount(bins.ids.cpu().long(), minlength=C * N).view(C, N)
@@ -274,7 +291,9 @@ def test_harmonics_are_the_recorded_ones(units: Any, backend: Backend, degree: i
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("name", ["tiny", "basic"])
 def test_images_of_gsplat_on_cuda(shared: Path, name: str, dtype: torch.dtype) -> None:
-    """Asked for: 5e-6. Measured 1.3e-6 (tiny) and 6.5e-7 (basic) in float64, which is their float32; alpha was clamped to 0.999."""
+    """Asked for: 5e-6. Measured 1.3e-6 (tiny) and 6.5e-7 (basic) in float64, which is their float32; alpha was clamped to
+    0.999.
+    """
     with numpy.load(shared / "data" / "gsplat_reference_images" / f"{name}_case.npz") as file:
         data = {k: torch.from_numpy(file[k]).to(dtype) for k in file.files}
     viewmat, K = torch.eye(4, dtype=dtype), torch.tensor([[61.5, 0.0, 61.5], [0.0, 61.5, 41.0], [0.0, 0.0, 1.0]], dtype=dtype)
@@ -284,7 +303,8 @@ def test_images_of_gsplat_on_cuda(shared: Path, name: str, dtype: torch.dtype) -
     assert (torch.cat([r.image, r.alpha[..., None]], -1) - data["out_img"]).abs().max() <= 2e-6
 
 
-@pytest.mark.parametrize(("file", "eye", "covered"), [("inria_train_first1000", (4.0, -0.5, 4.0), 0.1), ("playbot_lod3_31k", (1.5, -1.2, 1.8), 0.3),
+@pytest.mark.parametrize(("file", "eye", "covered"), [("inria_train_first1000", (4.0, -0.5, 4.0), 0.1),
+                                                      ("playbot_lod3_31k", (1.5, -1.2, 1.8), 0.3),
                                                       ("massa", (0.3, -0.7, 2.8), 0.2)])
 def test_trained_scenes_render(shared: Path, file: str, eye: tuple[float, ...], covered: float) -> None:
     """Finite, something to see, the same with any tile size, and the splats that show most as `plain` has them."""

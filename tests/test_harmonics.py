@@ -11,8 +11,8 @@ import pytest
 import scenes
 import torch
 import tsplat_reference as reference
+from backends import Backend
 from compare import assert_close, assert_same_bits, gradients, leaves, strided, threads
-from conftest import Backend
 from torch import Tensor
 
 from tsplat import ops
@@ -37,7 +37,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def test_the_basis_is_orthonormal() -> None:
-    z, wz = (torch.from_numpy(v) for v in numpy.polynomial.legendre.leggauss(6))       # exact to degree 11 in z, 12 angles to m = 11
+    z, wz = (torch.from_numpy(v) for v in numpy.polynomial.legendre.leggauss(6))  # exact to degree 11 in z, 12 angles to m = 11
     phi = torch.arange(12, dtype=torch.float64) * (2 * math.pi / 12)
     z, phi = (v.flatten() for v in torch.meshgrid(z, phi, indexing="ij"))
     directions = torch.stack([(1 - z * z).sqrt() * phi.cos(), (1 - z * z).sqrt() * phi.sin(), z], -1)
@@ -57,7 +57,7 @@ def test_values_and_gradients_match_the_definition(backend: Backend, degree: int
     plain_inputs, inputs = leaves(*inputs), leaves(*backend.put(tuple(inputs)))
     want = torch.where(mask[..., None], plain.harmonics(*plain_inputs, degree), 0.0)
     got = ops.harmonics(*inputs, degree, backend.put(mask))
-    assert_close(got, want, 1e-14)                                               # polynomials of degree <= 4 with factors up to 35
+    assert_close(got, want, 1e-14)  # polynomials of degree <= 4 with factors up to 35
     assert_close(gradients([got], inputs), gradients([want], plain_inputs), 1e-13)
 
 

@@ -1,4 +1,6 @@
-"""What torch expects of an operator: derivatives, fake kernels, compile, export, vmap, autocast, and errors instead of silence."""
+"""What torch expects of an operator: derivatives, fake kernels, compile, export, vmap, autocast, and errors instead of
+silence.
+"""
 
 from __future__ import annotations
 
@@ -11,8 +13,8 @@ import pytest
 import scenes
 import torch
 import tsplat_reference as reference
+from backends import BACKENDS, Backend
 from compare import assert_close, assert_same_bits, each, gradients, leaves, permuted, strided
-from conftest import BACKENDS, Backend
 from torch import Tensor
 from torch._dynamo.testing import CompileCounterWithBackend
 from torch._subclasses import FakeTensorMode
@@ -25,7 +27,8 @@ import tsplat
 from tsplat import Camera, ops
 
 WIDTH, HEIGHT, TILE = 7, 6, 4
-projection, harmonics, binning, blending = (importlib.import_module(f"tsplat.ops.{name}")        # the package has functions of these names
+# the package has functions of these names
+projection, harmonics, binning, blending = (importlib.import_module(f"tsplat.ops.{name}")
                                             for name in ("projection", "harmonics", "binning", "blending"))
 
 
@@ -55,8 +58,8 @@ def blend_arguments(n: int = 6, background: bool = True, absgrad: bool = True, s
     s = splats2d(n)
     colors = s.colors[:1] if shared_colors else s.colors
     bins = reference.bin_splats(*bin_arguments(n))
-    return (s.means2d, s.conics, s.opacities, colors, s.backgrounds if background else None, torch.zeros_like(s.means2d) if absgrad else None,
-            *bins, WIDTH, HEIGHT, TILE, 0.99)
+    return (s.means2d, s.conics, s.opacities, colors, s.backgrounds if background else None,
+            torch.zeros_like(s.means2d) if absgrad else None, *bins, WIDTH, HEIGHT, TILE, 0.99)
 
 
 def project_backward_arguments(antialiased: bool = True, covars: bool = False, n: int = 6) -> tuple[Any, ...]:
@@ -70,7 +73,8 @@ def harmonics_backward_arguments(degree: int = 2, n: int = 6) -> tuple[Any, ...]
     return *args, torch.randn_like(reference.harmonics(*args))
 
 
-def blend_backward_arguments(n: int = 6, background: bool = True, absgrad: bool = True, shared_colors: bool = False) -> tuple[Any, ...]:
+def blend_backward_arguments(n: int = 6, background: bool = True, absgrad: bool = True,
+                             shared_colors: bool = False) -> tuple[Any, ...]:
     args = blend_arguments(n, background, absgrad, shared_colors)
     image, alphas = reference.blend(*args[:5], *args[6:])
     return (*args[:5], *args[6:8], image, alphas, torch.randn_like(image), torch.randn_like(alphas), *args[8:], absgrad)
@@ -81,7 +85,8 @@ CASES: dict[str, tuple[Any, Callable[..., tuple[Any, ...]], dict[str, Any]]] = {
     "project, covars": (projection.project_op, project_arguments, {"covars": True, "antialiased": False}),
     "project, N = 0": (projection.project_op, project_arguments, {"n": 0}),
     "project_backward": (projection.project_backward_op, project_backward_arguments, {}),
-    "project_backward, covars": (projection.project_backward_op, project_backward_arguments, {"covars": True, "antialiased": False}),
+    "project_backward, covars": (projection.project_backward_op, project_backward_arguments,
+                                 {"covars": True, "antialiased": False}),
     "project_backward, N = 0": (projection.project_backward_op, project_backward_arguments, {"n": 0}),
     "harmonics": (harmonics.harmonics_op, harmonics_arguments, {}),
     "harmonics, degree 0": (harmonics.harmonics_op, harmonics_arguments, {"degree": 0}),
@@ -108,7 +113,8 @@ def case(name: str, backend: Backend) -> tuple[Any, list[Any]]:
 
 
 def require_grad(args: list[Any], but: tuple[int, ...] = ()) -> list[Any]:
-    return [a.requires_grad_() if isinstance(a, Tensor) and a.is_floating_point() and i not in but else a for i, a in enumerate(args)]
+    return [a.requires_grad_() if isinstance(a, Tensor) and a.is_floating_point() and i not in but else a for i,
+            a in enumerate(args)]
 
 
 # Operator contracts
@@ -116,14 +122,16 @@ def require_grad(args: list[Any], but: tuple[int, ...] = ()) -> list[Any]:
 
 @pytest.mark.parametrize("name", CASES)
 def test_opcheck(backend: Backend, name: str) -> None:
-    """Backward ops are traced without gradients of their own: the second derivative is eager by design, as it runs the reference."""
+    """Backward ops are traced without gradients of their own: the second derivative is eager by design, as it runs the
+    reference.
+    """
     op, args = case(name, backend)
     if name in FORWARD:
         args = require_grad(args)
     checks = ["test_schema", "test_autograd_registration", "test_faketensor"]
     opcheck(op, args, test_utils=checks)
 
-    def floating(*args: Any) -> list[Tensor]:                                     # opcheck's own version of this fails if an int comes first
+    def floating(*args: Any) -> list[Tensor]:  # opcheck's own version of this fails if an int comes first
         results = op(*args)
         return [r for r in ([results] if isinstance(results, Tensor) else results) if r.is_floating_point()] or list(results)
 
@@ -155,12 +163,13 @@ def test_fake_kernels_agree_with_real_ones(backend: Backend, name: str, layout: 
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_where_there_is_no_triton_other_devices_than_the_cpu_are_refused_clearly(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_where_there_is_no_triton_other_devices_than_the_cpu_are_refused_clearly(monkeypatch: pytest.MonkeyPatch,
+                                                                                 name: str) -> None:
     """With the CPU kernel out of the way, a CPU tensor stands for one on another device."""
     op, args = case(name, BACKENDS["reference"])
     for module in [m for m in sys.modules if m.startswith("tsplat.kernels.")]:
         monkeypatch.delitem(sys.modules, module)
-    monkeypatch.setitem(sys.modules, "triton", None)                              # an import of it fails as if it were not there
+    monkeypatch.setitem(sys.modules, "triton", None)  # an import of it fails as if it were not there
     message = rf"{name.split(',')[0]} on device 'cpu' needs Triton, which is not installed"
     with op.set_kernel_enabled("cpu", False), pytest.raises(NotImplementedError, match=message):
         op(*args)
@@ -257,11 +266,11 @@ def test_the_absolute_gradient_has_no_derivative_and_says_so(backend: Backend) -
         torch.autograd.grad(v_abs.sum(), args[0])
 
 
-def render(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor, viewmats: Tensor, Ks: Tensor, background: Tensor,
-           offset: Tensor, width: int = WIDTH, height: int = HEIGHT) -> tuple[Tensor, Tensor, Tensor]:
+def render(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, sh: Tensor, viewmats: Tensor, Ks: Tensor,
+           background: Tensor, offset: Tensor, width: int = WIDTH, height: int = HEIGHT) -> tuple[Tensor, Tensor, Tensor]:
     """All stages and options at once."""
-    r = tsplat.rasterize(means, quats, scales, opacities, sh, Camera(viewmats, Ks, width, height), sh_degree=1, background=background,
-                         depth="expected", antialiased=True, screen_offset=offset)
+    r = tsplat.rasterize(means, quats, scales, opacities, sh, Camera(viewmats, Ks, width, height), sh_degree=1,
+                         background=background, depth="expected", antialiased=True, screen_offset=offset)
     return r.image, r.alpha, r.depth
 
 
@@ -286,8 +295,9 @@ def test_the_renderer_is_differentiable_twice_with_every_option(backend: Backend
 
     def call(means: Tensor, opacities: Tensor, background: Tensor, viewmats: Tensor) -> list[Tensor]:
         shape = {"covars": reference.covariances(quats, scales)} if option == "covars" else {}
-        r = tsplat.rasterize(means, *((None, None) if shape else (quats, scales)), opacities, sh if option == "sh" else sh[:, 0],
-                             Camera(viewmats, Ks, 5, 4), sh_degree=1 if option == "sh" else None, background=background,
+        r = tsplat.rasterize(means, *((None, None) if shape else (quats, scales)), opacities,
+                             sh if option == "sh" else sh[:, 0], Camera(viewmats, Ks, 5, 4),
+                             sh_degree=1 if option == "sh" else None, background=background,
                              depth="accumulated" if option == "depth" else None, antialiased=antialiased, **shape)
         return [r.image, r.alpha, *([r.depth] if option == "depth" else [])]
 
@@ -328,7 +338,7 @@ def test_one_compilation_serves_all_sizes(backend: Backend) -> None:
         got, want = compiled(*args, width, height), render(*args, width, height)
         assert_same_bits(got, want)
         assert_close(gradients(got, args), gradients(want, args), 1e-14)
-        counts.append(counter.frame_count)                                        # the first compilation may make several attempts
+        counts.append(counter.frame_count)  # the first compilation may make several attempts
     assert counts == [counts[0]] * 4
 
 
@@ -365,7 +375,7 @@ def test_a_model_that_renders_exports(backend: Backend, strict: bool) -> None:
     names = {str(node.target) for node in program.graph.nodes}
     assert {f"tsplat.{stage}.default" for stage in ("project", "harmonics", "bin_splats", "blend")} <= names
     other = viewmats.flip(0).clone()
-    other[:, 0, 3] += 0.3                                                         # another number of hits than when it was traced
+    other[:, 0, 3] += 0.3  # another number of hits than when it was traced
     assert_same_bits([program.module()(other, Ks)], [model(other, Ks)])
 
 
@@ -383,7 +393,8 @@ def test_gradients_through_vmap_are_those_of_the_batch(backend: Backend) -> None
     _, args = case("project", backend)
     inputs = leaves(*args[5:7])
     mapped = torch.func.vmap(lambda v, K: ops.project(*args[:5], v[None], K[None], *args[7:]))(*inputs)
-    assert_close(gradients([x[:, 0] for x in mapped[1:]], inputs), gradients(ops.project(*args[:5], *inputs, *args[7:])[1:], inputs), 1e-15)
+    assert_close(gradients([x[:, 0] for x in mapped[1:]], inputs), gradients(ops.project(*args[:5], *inputs, *args[7:])[1:],
+                                                                             inputs), 1e-15)
 
 
 # Autocast

@@ -45,7 +45,7 @@ def test_pieces_run_on_the_workers_and_come_in_order() -> None:
 
     def work(rows: slice) -> int:
         names.add(threading.current_thread().name)
-        assert torch.get_num_threads() == 1                                       # torch's own threads would take the cores away
+        assert torch.get_num_threads() == 1  # torch's own threads would take the cores away
         assert not torch.is_grad_enabled()
         return rows.start
 
@@ -56,6 +56,14 @@ def test_pieces_run_on_the_workers_and_come_in_order() -> None:
     with threads(1):
         assert parallel.map_chunks(work, 50, 3) == list(range(0, 50, 3))
         assert names == {threading.current_thread().name}
+
+
+def test_the_caller_computes_on_one_thread_meanwhile() -> None:
+    """Else OpenMP's threads, which spin for a while after each operation, would take the cores away from the workers."""
+    with threads(2):
+        with parallel.workers():
+            assert torch.get_num_threads() == 1
+        assert torch.get_num_threads() == 2
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
@@ -127,6 +135,8 @@ sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="this system does not fork")
 def test_a_forked_process_starts_workers_of_its_own() -> None:
-    """Threads do not survive a fork. (Torch's own hang after one, so a child renders with one thread, as DataLoader sets it.)"""
+    """Threads do not survive a fork. (Torch's own hang after one, so a child renders with one thread, as DataLoader sets
+    it.)
+    """
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "reference")])}
     subprocess.run([sys.executable, "-W", "ignore", "-c", FORK], env=environment, timeout=60, check=True)

@@ -12,8 +12,8 @@ import pytest
 import scenes
 import torch
 import tsplat_reference as reference
+from backends import Backend
 from compare import assert_close, assert_same_bits, gradients, leaves, strided, threads
-from conftest import Backend
 from torch import Tensor
 
 from tsplat import Camera, ops
@@ -26,8 +26,8 @@ def arguments(splats: scenes.Splats3D, cam: Camera, *, covars: Tensor | None = N
               antialiased: bool = False) -> tuple[Any, ...]:
     """What `project` takes, of a batch of cameras."""
     quats, scales = (None, None) if covars is not None else (splats.quats, splats.scales)
-    return (splats.means, quats, scales, covars, splats.opacities, cam.viewmats, cam.Ks, cam.width, cam.height, cam.model, cam.near,
-            cam.far, eps2d, antialiased)
+    return (splats.means, quats, scales, covars, splats.opacities, cam.viewmats, cam.Ks, cam.width, cam.height, cam.model,
+            cam.near, cam.far, eps2d, antialiased)
 
 
 def differentiable(args: Sequence[Any]) -> tuple[list[Any], list[Tensor]]:
@@ -58,7 +58,8 @@ def test_the_wide_scene_has_visible_splats_beyond_the_clamp() -> None:
 @pytest.mark.parametrize("antialiased", [False, True])
 @pytest.mark.parametrize("eps2d", [0.0, 0.3])
 @pytest.mark.parametrize("model", MODELS)
-def test_values_and_gradients_match_the_plain_formulation(backend: Backend, model: str, eps2d: float, antialiased: bool) -> None:
+def test_values_and_gradients_match_the_plain_formulation(backend: Backend, model: str, eps2d: float,
+                                                          antialiased: bool) -> None:
     args = arguments(*far_and_wide(model), eps2d=eps2d, antialiased=antialiased)
     plain_args, plain_leaves = differentiable(args)
     want = plain.project(*plain_args)
@@ -141,12 +142,14 @@ CULLED = {
 
 
 @pytest.mark.parametrize(("why", "model"), [(why, model) for why in CULLED for model in MODELS
-                                            if model != "orthographic" or why not in ("behind", "at the camera")])     # which it sees
+                                            # which it sees
+                                            if model != "orthographic" or why not in ("behind", "at the camera")])
 def test_what_cannot_be_seen_is_culled_with_zeros_and_zero_gradient(backend: Backend, why: str, model: str) -> None:
     look, limits, mean = CULLED[why]
     splats = scene_at((0.0, 0.0, 2.5), mean, **look)
     splats.opacities[0] = 0.5
-    args, inputs = differentiable(backend.put(arguments(splats, scenes.camera(1, turn=0.0, model=model, **limits), antialiased=True)))
+    args, inputs = differentiable(backend.put(arguments(splats, scenes.camera(1, turn=0.0, model=model, **limits),
+                                                        antialiased=True)))
     got = ops.project(*args)
     assert (got.radii[0, 0] > 0).all()
     for values in got:
@@ -171,7 +174,8 @@ def test_antialiasing_may_make_a_splat_too_faint() -> None:
 
 @pytest.mark.parametrize("opacity", [1.001 / 255, 0.02, 0.3, 1.0])
 def test_the_box_holds_every_pixel_that_the_splat_can_touch_and_little_more(opacity: float) -> None:
-    splats, cam = scenes.splats(20, spread=0.3, size=(0.03, 0.2), opacity=(opacity, opacity)), scenes.camera(1, 90, 90, turn=0.0)
+    splats, cam = scenes.splats(20, spread=0.3, size=(0.03, 0.2), opacity=(opacity, opacity)), scenes.camera(1, 90, 90,
+                                                                                                             turn=0.0)
     got = reference.project(*arguments(splats, cam))
     pixels = plain.pixel_centers(90, 90)
     alpha = plain.alphas_everywhere(got.means2d[0], got.conics[0], splats.opacities, 90, 90, 0.99)
@@ -180,7 +184,8 @@ def test_the_box_holds_every_pixel_that_the_splat_can_touch_and_little_more(opac
         reach = (pixels - got.means2d[0, n]).abs()[alpha[..., n] > 0]
         if len(reach):
             assert (reach <= torch.tensor([rx, ry])).all()
-        # at the ellipse's outermost point alpha is 1/255: e sigma in front of ceil, and EXTENT_MAX rounds sqrt(2 ln 255) = 3.3291 up
+        # at the ellipse's outermost point alpha is 1/255: e sigma in front of ceil, and EXTENT_MAX rounds sqrt(2 ln 255) =
+        # 3.3291 up
         inverse = torch.linalg.inv(torch.stack([got.conics[0, n, :2], got.conics[0, n, 1:]]))
         exact = torch.diagonal(inverse).sqrt() * math.sqrt(2 * math.log(255 * opacity))
         assert (torch.tensor([rx, ry]) < exact * 1.001 + 1).all()
@@ -207,7 +212,7 @@ def test_chunks_change_nothing(monkeypatch: pytest.MonkeyPatch, model: str, cova
     parts = ops.project(*args)
     v_parts = gradients(parts[1:], inputs)
     assert torch.equal(parts.radii, whole.radii)
-    assert_close(parts[1:], whole[1:], 1e-15)                                    # a function may round otherwise at an array's end
+    assert_close(parts[1:], whole[1:], 1e-15)  # a function may round otherwise at an array's end
     assert_close(v_parts, v_whole, 1e-14)                                        # sums over the splats come in another order
     with threads(2):
         assert_same_bits(gradients(ops.project(*args)[1:], inputs), v_parts)
@@ -215,9 +220,12 @@ def test_chunks_change_nothing(monkeypatch: pytest.MonkeyPatch, model: str, cova
 
 @pytest.mark.parametrize("model", MODELS)
 def test_float32_is_as_good_as_float32_can_be(model: str) -> None:
-    """Errors against float64 on the same (float32) numbers, in eps = 6e-8 of the largest, for condition numbers of some hundred."""
+    """Errors against float64 on the same (float32) numbers, in eps = 6e-8 of the largest, for condition numbers of some
+    hundred.
+    """
     splats, cam = scenes.splats(300, size=(0.05, 0.5)), scenes.camera(2, model=model)
-    args32, inputs32 = differentiable([a.float() if isinstance(a, Tensor) else a for a in arguments(splats, cam, antialiased=True)])
+    args32, inputs32 = differentiable([a.float() if isinstance(a, Tensor) else a
+                                       for a in arguments(splats, cam, antialiased=True)])
     args64, inputs64 = differentiable([a.double() if isinstance(a, Tensor) else a for a in args32])
     got, want = ops.project(*args32), ops.project(*args64)
     assert all(x.dtype == torch.float32 for x in got[1:])
@@ -239,7 +247,8 @@ def test_a_splat_huge_for_one_camera_and_culled_by_another_has_finite_gradients(
     viewmats[:, 2, 3] = torch.tensor([-10.0, 1e4])
     cam = Camera(viewmats, scenes.camera(2).Ks, 24, 17)
     splats = scene_at((0.0, 0.0, 1.0), scale=scale)
-    args, inputs = differentiable([a.to(dtype) if isinstance(a, Tensor) else a for a in arguments(splats, cam, antialiased=True)])
+    args, inputs = differentiable([a.to(dtype) if isinstance(a, Tensor) else a
+                                   for a in arguments(splats, cam, antialiased=True)])
     got = ops.project(*args)
     assert (got.radii[0] == 0).all()
     for values in [*got, *gradients(got[1:], inputs)]:

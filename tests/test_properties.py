@@ -8,8 +8,8 @@ from typing import Any
 import plain
 import scenes
 import torch
+from backends import BACKENDS, Backend
 from compare import assert_close, assert_same_bits, gradients, leaves
-from conftest import BACKENDS, Backend
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
@@ -17,8 +17,10 @@ from torch import Tensor
 from tsplat import Camera, Rendering, rasterize
 
 ROUNDING = 1e-11
-"""log alpha is a polynomial about a tile's centre with terms of up to some hundred: evaluated otherwise, alpha differs by 1e2 eps = 2e-14, and
-what saturates multiplies that by up to 1/(1 - alpha_max) = 100 in the gradients, sums over splats and cancellation by some ten more."""
+"""log alpha is a polynomial about a tile's centre with terms of up to some hundred: evaluated otherwise, alpha differs by 1e2
+eps = 2e-14, and what saturates multiplies that by up to 1/(1 - alpha_max) = 100 in the gradients, sums over splats and
+cancellation by some ten more.
+"""
 
 some = settings(max_examples=12, deadline=None, derandomize=True)
 seeds = st.integers(0, 10**6)
@@ -38,7 +40,8 @@ def drawn(draw: st.DrawFn, cameras: int = 2) -> tuple[Backend, scenes.Splats3D, 
     if degree is not None:
         splats = splats._replace(colors=scenes.sh_coefficients(n, degree, splats.colors.shape[1], seed=seed))
     cam = scenes.camera(cameras, draw(st.integers(1, 30)), draw(st.integers(1, 30)), model=draw(models), seed=seed, near=2.2)
-    options = {"sh_degree": degree, "antialiased": draw(st.booleans()), "depth": draw(st.sampled_from([None, "accumulated", "expected"]))}
+    options = {"sh_degree": degree, "antialiased": draw(st.booleans()),
+               "depth": draw(st.sampled_from([None, "accumulated", "expected"]))}
     return backend, backend.put(splats), backend.put(cam), options
 
 
@@ -63,7 +66,8 @@ def test_the_order_of_the_splats_does_not_matter(scene: Any, seed: int) -> None:
 def test_the_order_of_the_cameras_does_not_matter(scene: Any) -> None:
     _, splats, cam, options = scene
     order = torch.tensor([2, 0, 1])
-    assert_close([x[order] for x in outputs(rasterize(*splats, cam, **options))], outputs(rasterize(*splats, cam[order], **options)), ROUNDING)
+    assert_close([x[order] for x in outputs(rasterize(*splats, cam, **options))],
+                 outputs(rasterize(*splats, cam[order], **options)), ROUNDING)
 
 
 @some
@@ -106,7 +110,8 @@ def test_a_crop_is_a_window(scene: Any, x: int, y: int, width: int, height: int)
         for viewmat, K in zip(cam.viewmats, Ks, strict=True):
             for i, mean in enumerate(splats.means):
                 p = viewmat[:3, :3] @ mean + viewmat[:3, 3]
-                inside[i] &= bool(p[2] > 0) and torch.equal(plain.jacobian_point(p, K, width, height, "pinhole")[:2], p[:2] / p[2] * p[2])
+                inside[i] &= bool(p[2] > 0) and torch.equal(plain.jacobian_point(p, K, width, height, "pinhole")[:2],
+                                                            p[:2] / p[2] * p[2])
         splats = scenes.Splats3D(*(v[inside] for v in splats))
     whole, part = outputs(rasterize(*splats, cam, **options)), outputs(rasterize(*splats, window, **options))
     # the shift rounds positions of some ten pixels in the last place: 1e-14, over the least size of half a pixel
@@ -179,8 +184,8 @@ def test_colours_go_in_linearly(scene: Any, factor: float) -> None:
 def test_it_is_the_plain_formulation(scene: Any) -> None:
     _, splats, cam, options = scene
     inputs, plain_inputs = leaves(*splats), leaves(*(x.cpu().double() for x in splats))
-    want = [x for x in plain.render(*plain_inputs, cam.viewmats.cpu().double(), cam.Ks.cpu().double(), cam.width, cam.height, model=cam.model,
-                                    near=cam.near, **options) if x is not None]
+    want = [x for x in plain.render(*plain_inputs, cam.viewmats.cpu().double(), cam.Ks.cpu().double(), cam.width, cam.height,
+                                    model=cam.model, near=cam.near, **options) if x is not None]
     got = outputs(rasterize(*inputs, cam, **options))
     assert_close(got, want, ROUNDING)
     assert_close(gradients(got, inputs), gradients(want, plain_inputs), 100 * ROUNDING)

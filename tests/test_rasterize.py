@@ -11,8 +11,8 @@ import plain
 import pytest
 import scenes
 import torch
+from backends import Backend
 from compare import assert_close, assert_same_bits, gradients, leaves
-from conftest import Backend
 from torch import Tensor
 
 import tsplat
@@ -21,11 +21,13 @@ from tsplat import Camera, rasterize
 MODELS = ("pinhole", "orthographic", "fisheye")
 
 
-def both(backend: Backend, splats: scenes.Splats3D, cam: Camera, **options: Any) -> tuple[list[Tensor], list[Tensor], list[Tensor], list[Tensor]]:
+def both(backend: Backend, splats: scenes.Splats3D, cam: Camera, **options: Any) -> tuple[list[Tensor], list[Tensor],
+                                                                                          list[Tensor], list[Tensor]]:
     """Outputs and gradients of `rasterize`, outputs and gradients of `plain.render`, for the same scene and options."""
     results = []
     for where in (backend, None):
-        s, c, o = (splats, cam, options) if where is None else (where.put(splats), where.put(cam), {k: where.put(v) for k, v in options.items()})
+        s, c, o = (splats, cam, options) if where is None else (where.put(splats), where.put(cam),
+                                                                {k: where.put(v) for k, v in options.items()})
         o = {k: v.clone().requires_grad_() if isinstance(v, Tensor) else v for k, v in o.items()}
         given = [x for x in s if x is not None]
         new = leaves(*given, c.viewmats, c.Ks)
@@ -55,8 +57,9 @@ def test_camera_models(backend: Backend, model: str, antialiased: bool) -> None:
     """With everything else: SH, background, expected depth, an offset on the screen, and several cameras."""
     g = scenes.generator(7)
     splats = scenes.splats(60)._replace(colors=scenes.sh_coefficients(60, 3))
-    assert_match(backend, splats, scenes.camera(3, model=model, near=2.5, far=5.5), antialiased=antialiased, sh_degree=3, depth="expected",
-                 background=scenes.uniform(0.0, 1.0, 3, 3, seed=g), screen_offset=scenes.normal(3, 60, 2, seed=g) * 0.1)
+    assert_match(backend, splats, scenes.camera(3, model=model, near=2.5, far=5.5), antialiased=antialiased, sh_degree=3,
+                 depth="expected", background=scenes.uniform(0.0, 1.0, 3, 3, seed=g),
+                 screen_offset=scenes.normal(3, 60, 2, seed=g) * 0.1)
 
 
 @pytest.mark.parametrize("degree", range(5))
@@ -153,7 +156,7 @@ def test_meta_tells_what_was_drawn(backend: Backend) -> None:
     assert torch.equal(meta.visible.cpu(), visible)
     assert torch.equal(meta.visible_ids.cpu(), visible.nonzero())
     assert_close([meta.means2d, meta.depths], [want.means2d, want.depths], 1e-14)
-    hits = torch.zeros(2, 5, 6)                                                   # tiles with at least this many splats in some pixel
+    hits = torch.zeros(2, 5, 6)  # tiles with at least this many splats in some pixel
     for c in range(2):
         alpha = plain.alphas_everywhere(want.means2d[c], want.conics[c], splats.opacities * visible[c], 24, 17, 0.99)
         padded = torch.zeros(20, 24, 40, dtype=torch.bool)
@@ -193,8 +196,8 @@ def test_absolute_gradient(backend: Backend) -> None:
     p = plain.project(*splats[:3], None, splats.opacities, cam.viewmats, cam.Ks, 24, 17, "pinhole", 0.01, 1e10, 0.3, False)
     g = scenes.generator(0)
     v_image, v_alpha = scenes.normal(2, 17, 24, 3, seed=g), scenes.normal(2, 17, 24, seed=g)
-    want = plain.absolute_gradient(p.means2d, p.conics, splats.opacities.expand(2, -1), splats.colors[None], None, p.depths, p.radii, 24, 17,
-                                   v_image, v_alpha)
+    want = plain.absolute_gradient(p.means2d, p.conics, splats.opacities.expand(2, -1), splats.colors[None], None, p.depths,
+                                   p.radii, 24, 17, v_image, v_alpha)
     splats, cam = backend.put((splats, cam))
     probe = torch.zeros(2, 40, 2, dtype=backend.dtype, device=backend.device, requires_grad=True)
     r = rasterize(*splats, cam, absgrad=probe)
@@ -208,7 +211,8 @@ def test_float32_and_float64_agree_to_rounding() -> None:
     single = rasterize(*(x.float() for x in splats), cam.to(torch.float32), depth="expected")
     double = rasterize(*(x.float().double() for x in splats), cam.to(torch.float32).to(torch.float64), depth="expected")
     assert single.image.dtype == torch.float32
-    # means2d of 24 pixels are off by 24 eps, alpha by that over the splat's size of half a pixel: 1e-5 with the conics' condition
+    # means2d of 24 pixels are off by 24 eps, alpha by that over the splat's size of half a pixel: 1e-5 with the conics'
+    # condition
     assert_close(single[:3], double[:3], 1e-5)
 
 
@@ -240,11 +244,13 @@ WRONG: list[tuple[type[Exception], str, dict[str, Any]]] = [
     (ValueError, "means: expected shape [N, 3]; got [15]", {"means": SPLATS.means.flatten()}),
     (ValueError, "quats: expected shape [5, 4]; got [5, 3]", {"quats": SPLATS.means}),
     (TypeError, "quats: expected a torch.Tensor of shape [5, 4]; got NoneType", {"quats": None}),
-    (TypeError, "quats: expected dtype torch.float64, as the other arguments have; got torch.float32", {"quats": SPLATS.quats.float()}),
+    (TypeError, "quats: expected dtype torch.float64, as the other arguments have; got torch.float32",
+     {"quats": SPLATS.quats.float()}),
     (ValueError, "scales: expected shape [5, 3]; got [4, 3]", {"scales": SPLATS.scales[:4]}),
     (TypeError, "scales: expected a torch.Tensor of shape [5, 3]; got NoneType", {"scales": None}),
     (ValueError, "opacities: expected shape [5]; got [5, 1]", {"opacities": SPLATS.opacities[:, None]}),
-    (ValueError, "opacities: expected device cpu, where the other arguments are; got meta", {"opacities": SPLATS.opacities.to("meta")}),
+    (ValueError, "opacities: expected device cpu, where the other arguments are; got meta",
+     {"opacities": SPLATS.opacities.to("meta")}),
     (TypeError, "colors: expected a torch.Tensor of shape [5, D]; got NoneType", {"colors": None}),
     (ValueError, "colors: expected shape [5, D]; got [5]", {"colors": SPLATS.opacities}),
     (ValueError, "colors: expected shape [2, 5, D]; got [3, 5, 3]", {"colors": SPLATS.colors.expand(3, 5, 3)}),
@@ -260,7 +266,8 @@ WRONG: list[tuple[type[Exception], str, dict[str, Any]]] = [
      {"camera": CAMERA.to(torch.float32)}),
     (ValueError, "covars: expected shape [5, 3, 3]; got [5, 3]", {"covars": SPLATS.means, "quats": None, "scales": None}),
     (ValueError, "covars: expected quats and scales to be None", {"covars": torch.eye(3, dtype=f64).expand(5, 3, 3)}),
-    (ValueError, "covars: expected quats and scales to be None", {"covars": torch.eye(3, dtype=f64).expand(5, 3, 3), "quats": None}),
+    (ValueError, "covars: expected quats and scales to be None", {"covars": torch.eye(3, dtype=f64).expand(5, 3, 3),
+                                                                  "quats": None}),
     (TypeError, "background: expected a torch.Tensor of shape [3]; got float", {"background": 1.0}),
     (ValueError, "background: expected shape [3]; got [4]", {"background": torch.ones(4, dtype=f64)}),
     (ValueError, "background: expected shape [2, 3]; got [3, 3]", {"background": torch.ones(3, 3, dtype=f64)}),
@@ -282,7 +289,8 @@ WRONG: list[tuple[type[Exception], str, dict[str, Any]]] = [
 
 
 @pytest.mark.parametrize(("kind", "message", "changes"), WRONG, ids=[f"{m[1][:40]} {i}" for i, m in enumerate(WRONG)])
-def test_errors_name_the_argument_what_came_and_what_is_expected(kind: type[Exception], message: str, changes: dict[str, Any]) -> None:
+def test_errors_name_the_argument_what_came_and_what_is_expected(kind: type[Exception], message: str,
+                                                                 changes: dict[str, Any]) -> None:
     arguments = {**SPLATS._asdict(), "camera": CAMERA, **changes}
     with pytest.raises((TypeError, ValueError), match=re.escape(message)) as caught:
         rasterize(**arguments)

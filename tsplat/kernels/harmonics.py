@@ -192,8 +192,9 @@ def harmonics_fwd_kernel(means, centers, coeffs, mask, out, N, C, K: tl.constexp
 @triton.jit(do_not_specialize=["N", "C"])
 def harmonics_bwd_kernel(means, centers, coeffs, mask, v_out, v_means, v_coeffs, partial_centers, N, C, K: tl.constexpr, D: tl.constexpr,
                          DEGREE: tl.constexpr, CHANNELS: tl.constexpr, CHUNK: tl.constexpr, BLOCK: tl.constexpr):
-    """Gradients of one block of splats and one group of channels: v_coeffs; v_means `[groups, N, 3]` and, summed over the block,
-    `[groups, programs, C, 4]` for -v_centers, which torch adds up: no atomics, the same bits in every run.
+    """Gradients of one block of splats and one group of channels: v_coeffs; v_means `[groups, N, 3]`; -v_centers, summed over the block.
+
+    These sums `[groups x programs, C, 4]`, and the groups, torch adds up: no atomics, the same bits in every run.
     """
     USED: tl.constexpr = (DEGREE + 1) * (DEGREE + 1)
     COUNT: tl.constexpr = USED * CHANNELS
@@ -226,7 +227,7 @@ def harmonics_bwd_kernel(means, centers, coeffs, mask, v_out, v_means, v_coeffs,
                 v_b += (value,)
             v_unit = basis_backward(unit[0], unit[1], unit[2], v_b, DEGREE)
             along = dot(unit, v_unit)
-            some = v[0] != 0                            # else 0, also where the coefficients are not finite
+            some = v[0] != 0                            # else the gradient is 0, also where the coefficients are not finite
             for d in tl.static_range(1, CHANNELS):
                 some |= v[d] != 0
             v_x = tl.where(some, (v_unit[0] - unit[0] * along) * inverse, 0.0)
@@ -246,7 +247,6 @@ def harmonics_bwd_kernel(means, centers, coeffs, mask, v_out, v_means, v_coeffs,
             store_row(v_rows + k * D, v_f[k * CHANNELS:(k + 1) * CHANNELS], inside, CHANNELS, CHUNK)
     if DEGREE > 0:
         store_row(v_means + (tl.program_id(1).to(tl.int64) * N + n) * 3, v_mean, inside, 3, 1)
-
 
 
 def harmonics(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:

@@ -122,8 +122,8 @@ def harmonics_basis(directions: Tensor, degree: int) -> Tensor:
             if l > m:
                 legendre[l] = ((2 * l - 1) * z * legendre[l - 1] - (l + m - 1) * legendre[l - 2]) / (l - m)
             norm = math.sqrt((2 * l + 1) / (4 * math.pi) * math.factorial(l - m) / math.factorial(l + m) * (2 if m else 1))
-            columns[l, m], columns[l, -m] = norm * legendre[l] * power.real, norm * legendre[l] * (power.imag
-                                                                                                   if m else power.real)
+            columns[l, m] = norm * legendre[l] * power.real
+            columns[l, -m] = norm * legendre[l] * (power.imag if m else power.real)
     return torch.stack([columns[l, m] for l in range(degree + 1) for m in range(-l, l + 1)], -1)
 
 

@@ -163,8 +163,7 @@ def test_fake_kernels_agree_with_real_ones(backend: Backend, name: str, layout: 
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_where_there_is_no_triton_other_devices_than_the_cpu_are_refused_clearly(monkeypatch: pytest.MonkeyPatch,
-                                                                                 name: str) -> None:
+def test_without_triton_other_devices_than_the_cpu_are_refused_clearly(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """With the CPU kernel out of the way, a CPU tensor stands for one on another device."""
     op, args = case(name, BACKENDS["reference"])
     for module in [m for m in sys.modules if m.startswith("tsplat.kernels.")]:
@@ -393,8 +392,8 @@ def test_gradients_through_vmap_are_those_of_the_batch(backend: Backend) -> None
     _, args = case("project", backend)
     inputs = leaves(*args[5:7])
     mapped = torch.func.vmap(lambda v, K: ops.project(*args[:5], v[None], K[None], *args[7:]))(*inputs)
-    assert_close(gradients([x[:, 0] for x in mapped[1:]], inputs), gradients(ops.project(*args[:5], *inputs, *args[7:])[1:],
-                                                                             inputs), 1e-15)
+    batch = ops.project(*args[:5], *inputs, *args[7:])
+    assert_close(gradients([x[:, 0] for x in mapped[1:]], inputs), gradients(batch[1:], inputs), 1e-15)
 
 
 # Autocast

@@ -174,8 +174,8 @@ def test_antialiasing_may_make_a_splat_too_faint() -> None:
 
 @pytest.mark.parametrize("opacity", [1.001 / 255, 0.02, 0.3, 1.0])
 def test_the_box_holds_every_pixel_that_the_splat_can_touch_and_little_more(opacity: float) -> None:
-    splats, cam = scenes.splats(20, spread=0.3, size=(0.03, 0.2), opacity=(opacity, opacity)), scenes.camera(1, 90, 90,
-                                                                                                             turn=0.0)
+    splats = scenes.splats(20, spread=0.3, size=(0.03, 0.2), opacity=(opacity, opacity))
+    cam = scenes.camera(1, 90, 90, turn=0.0)
     got = reference.project(*arguments(splats, cam))
     pixels = plain.pixel_centers(90, 90)
     alpha = plain.alphas_everywhere(got.means2d[0], got.conics[0], splats.opacities, 90, 90, 0.99)

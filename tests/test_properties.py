@@ -110,8 +110,8 @@ def test_a_crop_is_a_window(scene: Any, x: int, y: int, width: int, height: int)
         for viewmat, K in zip(cam.viewmats, Ks, strict=True):
             for i, mean in enumerate(splats.means):
                 p = viewmat[:3, :3] @ mean + viewmat[:3, 3]
-                inside[i] &= bool(p[2] > 0) and torch.equal(plain.jacobian_point(p, K, width, height, "pinhole")[:2],
-                                                            p[:2] / p[2] * p[2])
+                free = plain.jacobian_point(p, K, width, height, "pinhole")
+                inside[i] &= bool(p[2] > 0) and torch.equal(free[:2], p[:2] / p[2] * p[2])
         splats = scenes.Splats3D(*(v[inside] for v in splats))
     whole, part = outputs(rasterize(*splats, cam, **options)), outputs(rasterize(*splats, window, **options))
     # the shift rounds positions of some ten pixels in the last place: 1e-14, over the least size of half a pixel

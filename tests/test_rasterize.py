@@ -21,32 +21,28 @@ from tsplat import Camera, rasterize
 MODELS = ("pinhole", "orthographic", "fisheye")
 
 
-def both(backend: Backend, splats: scenes.Splats3D, cam: Camera, **options: Any) -> tuple[list[Tensor], list[Tensor],
-                                                                                          list[Tensor], list[Tensor]]:
-    """Outputs and gradients of `rasterize`, outputs and gradients of `plain.render`, for the same scene and options."""
-    results = []
-    for where in (backend, None):
-        s, c, o = (splats, cam, options) if where is None else (where.put(splats), where.put(cam),
-                                                                {k: where.put(v) for k, v in options.items()})
-        o = {k: v.clone().requires_grad_() if isinstance(v, Tensor) else v for k, v in o.items()}
-        given = [x for x in s if x is not None]
-        new = leaves(*given, c.viewmats, c.Ks)
-        it = iter(new)
-        s = scenes.Splats3D(*(None if x is None else next(it) for x in s))
-        viewmats, Ks = it
-        if where is None:
-            out = plain.render(*s, viewmats, Ks, c.width, c.height, model=c.model, near=c.near, far=c.far, **o)
-        else:
-            out = rasterize(*s, dataclasses.replace(c, viewmats=viewmats, Ks=Ks), **o)[:3]
-        out = [x for x in out if x is not None]
-        inputs = [*new, *(v for v in o.values() if isinstance(v, Tensor))]
-        results += [out, gradients(out, inputs)]
-    return results[0], results[2], results[1], results[3]
+def run(backend: Backend | None, splats: scenes.Splats3D, cam: Camera, options: dict[str, Any]
+        ) -> tuple[list[Tensor], list[Tensor]]:
+    """Outputs and gradients of all tensors given, by `rasterize` on a backend, or by `plain.render` for None."""
+    if backend is not None:
+        splats, cam, options = backend.put(splats), backend.put(cam), {k: backend.put(v) for k, v in options.items()}
+    options = {k: v.clone().requires_grad_() if isinstance(v, Tensor) else v for k, v in options.items()}
+    inputs = leaves(*(x for x in splats if x is not None), cam.viewmats, cam.Ks)
+    *new, viewmats, Ks = inputs
+    given = iter(new)
+    splats = scenes.Splats3D(*(None if x is None else next(given) for x in splats))
+    if backend is None:
+        size = cam.width, cam.height
+        outputs = plain.render(*splats, viewmats, Ks, *size, model=cam.model, near=cam.near, far=cam.far, **options)
+    else:
+        outputs = rasterize(*splats, dataclasses.replace(cam, viewmats=viewmats, Ks=Ks), **options)[:3]
+    outputs = [x for x in outputs if x is not None]
+    return outputs, gradients(outputs, [*inputs, *(v for v in options.values() if isinstance(v, Tensor))])
 
 
 def assert_match(backend: Backend, splats: scenes.Splats3D, cam: Camera, **options: Any) -> None:
     """Values to 1e-13; gradients to 1e-10 of the largest, as those of projection multiply the errors of those of blending."""
-    got, want, v_got, v_want = both(backend, splats, cam, **options)
+    (got, v_got), (want, v_want) = run(backend, splats, cam, options), run(None, splats, cam, options)
     assert_close(got, want, 1e-13)
     assert_close(v_got, v_want, 1e-10)
 
@@ -266,8 +262,8 @@ WRONG: list[tuple[type[Exception], str, dict[str, Any]]] = [
      {"camera": CAMERA.to(torch.float32)}),
     (ValueError, "covars: expected shape [5, 3, 3]; got [5, 3]", {"covars": SPLATS.means, "quats": None, "scales": None}),
     (ValueError, "covars: expected quats and scales to be None", {"covars": torch.eye(3, dtype=f64).expand(5, 3, 3)}),
-    (ValueError, "covars: expected quats and scales to be None", {"covars": torch.eye(3, dtype=f64).expand(5, 3, 3),
-                                                                  "quats": None}),
+    (ValueError, "covars: expected quats and scales to be None",
+     {"covars": torch.eye(3, dtype=f64).expand(5, 3, 3), "quats": None}),
     (TypeError, "background: expected a torch.Tensor of shape [3]; got float", {"background": 1.0}),
     (ValueError, "background: expected shape [3]; got [4]", {"background": torch.ones(4, dtype=f64)}),
     (ValueError, "background: expected shape [2, 3]; got [3, 3]", {"background": torch.ones(3, 3, dtype=f64)}),

@@ -84,10 +84,13 @@ def _backward(ctx: Any, v_image: Tensor, v_alphas: Tensor) -> tuple[Any, ...]:
 def _save_backward(ctx: Any, inputs: tuple[Any, ...], output: Six) -> None:
     *differentiable, ids, offsets, _, _, v_image, v_alphas = inputs[:11]
     ctx.options = inputs[11:15]
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(*differentiable, ids, offsets, v_image, v_alphas)
 
 
 def _double_backward(ctx: Any, *v_gradients: Tensor) -> tuple[Any, ...]:
+    if v_gradients[5] is not None:
+        raise NotImplementedError("tsplat: absgrad has no derivative; it is a measure for density control")
     means2d, conics, opacities, colors, backgrounds, ids, offsets, v_image, v_alphas = ctx.saved_tensors
 
     def forward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None) -> tuple[Tensor, Tensor]:

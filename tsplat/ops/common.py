@@ -44,7 +44,8 @@ def reject_forward_mode(name: str, *tensors: Tensor | None) -> None:
         return
     for tensor in tensors:
         if tensor is not None and forward_ad.unpack_dual(tensor).tangent is not None:  # type: ignore[no-untyped-call]
-            raise NotImplementedError(f"tsplat: {name} has no forward-mode derivative (jvp); use reverse mode, or torch.func.vjp")
+            raise NotImplementedError(f"tsplat: {name} has no forward-mode derivative (jvp); use reverse mode: backward() or "
+                                      "torch.autograd.grad")
 
 
 def register_autocast(*ops: CustomOpDef) -> None:

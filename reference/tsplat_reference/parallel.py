@@ -28,20 +28,21 @@ if hasattr(os, "register_at_fork"):
 
 
 @contextlib.contextmanager
-def workers() -> Iterator[Callable[[Callable[[T], R], Sequence[T]], Iterator[R]]]:
+def workers(worth: bool = True) -> Iterator[Callable[[Callable[[T], R], Sequence[T]], Iterator[R]]]:
     """Gives a map over independent pieces, without autograd, on `torch.get_num_threads()` threads.
 
     Meanwhile the calling thread's own operations are single-threaded, too: after a parallel one, OpenMP's threads would spin for a
-    while and take the cores away from the workers.
+    while and take the cores away from the workers. With `worth` False there are no workers, and all is done by the calling thread: where
+    there is little to do, handing it over costs more than it gains.
     """
     threads = torch.get_num_threads()
     if threads == 1:
         yield _plain_map
         return
-    pool = _pool(threads)
+    pool = _pool(threads) if worth else None
     torch.set_num_threads(1)
     try:
-        yield functools.partial(_pool_map, pool, threads)
+        yield _plain_map if pool is None else functools.partial(_pool_map, pool, threads)
     finally:
         torch.set_num_threads(threads)
 

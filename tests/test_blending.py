@@ -139,6 +139,7 @@ def test_chunks_blocks_and_groups_change_nothing(monkeypatch: pytest.MonkeyPatch
     got = run()
     assert_close(got[:2], want[:2], 1e-14)
     assert_close(got[2:], want[2:], 1e-12)
+    monkeypatch.setattr(blocks, "WORTH_WORKERS", 0)
     with threads(2):
         assert_same_bits(run(), got)
 
@@ -297,8 +298,8 @@ def test_float32_stays_within_its_rounding_errors(tile: int) -> None:
     """|d log alpha| is eps times the terms of the polynomial, and |dC| <= 2 max|c| |d log alpha|, as sum_i |dC/dlog alpha_i| <=
     2 max|c|.
 
-    Products and sums along a list of n splats add n eps. Pixels where a decision (1/255, the stop) is as close as that may flip
-    it.
+    Products and sums along a list of n splats add sqrt(n) eps, as rounding errors are random. Pixels where a decision (1/255,
+    the stop) is as close as that may flip it.
     """
     s64 = scenes.splats2d(1, 200, 40, 32, size=(0.6, 9.0), background=False)
     s32, inputs32 = differentiable(scenes.Splats2D(*[x.float() if x is not None and x.is_floating_point() else x for x in s64]))
@@ -310,10 +311,12 @@ def test_float32_stays_within_its_rounding_errors(tile: int) -> None:
     record = footprint.records(s64.means2d[0], s64.conics[0], s64.opacities[0])[:, ids.long()][:, None]
     tiles_x = reference.tile_counts(40, 32, tile)[0]
     centre = [((v * tile + tile / 2) - m)[None] for v, m in ((owner % tiles_x, record[0, 0]), (owner // tiles_x, record[1, 0]))]
-    terms = footprint.coefficients(record, *centre)[0].abs().T @ footprint.monomials(tile, torch.float64, ids.device).abs()
+    coefficients, monomials = footprint.coefficients(record, *centre)[0].T, footprint.monomials(tile, torch.float64, ids.device)
+    seen = coefficients @ monomials > math.log(1 / 255)                           # [hits, pixels]
+    terms = (coefficients.abs() @ monomials.abs())[seen].detach()
     alpha = plain.alphas_everywhere(s64.means2d[0], s64.conics[0], s64.opacities[0], 40, 32, ALPHA_MAX)
     longest = int(offsets.diff().max())
-    error = 4 * eps * terms.max().item() + longest * eps
+    error = eps * (terms.max().item() + longest**0.5)
     d = plain.pixel_centers(40, 32)[:, :, None] - s64.means2d[0]
     log_alpha = footprint.log_alpha(d[..., 0], d[..., 1], s64.conics[0], s64.opacities[0])
     got, want = (blend(ops.blend, s, 40, 32, tile, bins=reference.Bins(ids, offsets)) for s in (s32, s64))
@@ -326,12 +329,11 @@ def test_float32_stays_within_its_rounding_errors(tile: int) -> None:
         difference = (g - w).abs()[0]
         assert difference[~close].max() <= 2 * error
         assert difference.max() <= 2 * error + 1 / 255
-    # dL/dlog alpha_i = w_i (g_i - R_i/T_{i+1}), R by subtraction from a sum: eps / (1 - alpha_max) of the largest, times the
-    # terms above
+    # dL/dlog alpha_i = w_i (g_i - R_i/T_{i+1}) takes R by subtraction from a sum, with its error, and T with that of log alpha
     calm = (~close).float()[None]
     v32, v64 = (torch.autograd.grad([(image * calm[..., None]).sum() + (alpha * calm).sum()], inputs)
                 for (image, alpha), inputs in ((got, inputs32), (want, inputs64)))
-    assert_close(v32, v64, 100 * error)
+    assert_close(v32, v64, 2 * error)
 
 
 class Peak(TorchDispatchMode):

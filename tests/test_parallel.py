@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import scenes
@@ -29,15 +32,44 @@ def results() -> list[Tensor]:
     return [*outputs, *gradients(outputs, inputs)]
 
 
-def test_results_have_the_same_bits_with_any_number_of_threads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("tsplat_reference.blocks.GROUP_TILES", 8)                 # more groups than threads
-    monkeypatch.setattr("tsplat_reference.projection.CHUNK", 64)
+@pytest.fixture
+def many_pieces(monkeypatch: pytest.MonkeyPatch) -> set[str]:
+    """Small pieces of work, and workers even for little of it; the names of the threads that did some."""
+    names: set[str] = set()
+    call = parallel._call
+
+    def named(function: Callable[[Any], Any], item: Any) -> Any:
+        names.add(threading.current_thread().name)
+        return call(function, item)
+
+    monkeypatch.setattr(parallel, "_call", named)
+    small = {"blocks.GROUP_TILES": 8, "blocks.WORTH_WORKERS": 0, "projection.CHUNK": 64, "harmonics.CHUNK": 64}
+    for name, value in small.items():
+        module, constant = name.split(".")
+        monkeypatch.setattr(importlib.import_module(f"tsplat_reference.{module}"), constant, value)
+    return names
+
+
+def test_results_have_the_same_bits_with_any_number_of_threads(many_pieces: set[str]) -> None:
     with threads(1):
         want = results()
+    assert many_pieces == {threading.current_thread().name}
     for count in (2, 3):
+        many_pieces.clear()
         with threads(count):
             assert_same_bits(results(), want)
             assert_same_bits(results(), want)
+        assert len(many_pieces) > 1
+        assert all("tsplat" in name for name in many_pieces)
+
+
+def test_little_work_is_not_handed_over(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It takes longer with workers; the bits are the same."""
+    with threads(1):
+        want = results()
+    monkeypatch.setattr(parallel, "_pool", lambda count: pytest.fail("workers for 500 splats"))
+    with threads(2):
+        assert_same_bits(results(), want)
 
 
 def test_pieces_run_on_the_workers_and_come_in_order() -> None:
@@ -67,6 +99,7 @@ def test_the_caller_computes_on_one_thread_meanwhile() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.usefixtures("many_pieces")
 def test_the_number_of_threads_is_as_before(count: int) -> None:
     with threads(count):
         results()
@@ -101,7 +134,7 @@ def test_few_results_wait() -> None:
             assert len(done) <= i + 1 + 4
 
 
-def test_threads_of_the_caller_may_render_at_the_same_time() -> None:
+def test_threads_of_the_caller_may_render_at_the_same_time(many_pieces: set[str]) -> None:
     want = results()
     found: dict[int, list[Tensor]] = {}
 
@@ -115,6 +148,7 @@ def test_threads_of_the_caller_may_render_at_the_same_time() -> None:
         for t in running:
             t.join(60)
         assert torch.get_num_threads() == 2
+    assert any("tsplat" in name for name in many_pieces)
     assert sorted(found) == [0, 1, 2]
     for mine in found.values():
         assert_same_bits(mine, want)

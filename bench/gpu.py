@@ -30,6 +30,8 @@ from torch import Tensor
 
 import tsplat
 from tsplat import ops
+from tsplat.ops.blending import blend_backward_op
+from tsplat.ops.projection import project_backward_op
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZES = {"1080p": (1920, 1080), "4K": (3840, 2160)}
@@ -43,12 +45,17 @@ def main() -> int:
                         help="folder with data/garden and data/splats; scenes that are not there are left out, and named")
     parser.add_argument("--quick", action="store_true", help="1080p, up to 1M splats, 3 channels only")
     parser.add_argument("--no-tests", action="store_true", help="leave out the test suite")
+    parser.add_argument("--profile", action="store_true", help="only print the kernels of a forward and backward, with their times")
     args = parser.parse_args()
     if not torch.cuda.is_available():
         print("bench/gpu.py: no GPU: torch.cuda.is_available() is False. Run it where there is one; for a CPU there is bench/cpu.py",
               file=sys.stderr)
         return 2
     device = torch.device("cuda")
+    if args.profile:
+        for name, scene, channels in fixed_scenes(args.data, True):
+            print(f"{name}, {channels} channels\n{profile(to(scene, device))}", flush=True)
+        return 0
     report: dict[str, Any] = {**environment(), "copy_GBps": copy_bandwidth(device)}
     print(json.dumps(report, indent=1))
     if not args.no_tests:
@@ -154,7 +161,6 @@ def milliseconds(run: Callable[[], object], times: int = 20) -> tuple[float, flo
 def measure(scene: Scene, copy_GBps: float) -> dict[str, Any]:
     """Times in ms, memory in MiB, share of the floor that memory traffic sets, and gsplat beside it."""
     camera, width, height = scene.camera, scene.camera.width, scene.camera.height
-    viewmats, Ks = camera.viewmats[None], camera.Ks[None]
     leaves = [x.clone().requires_grad_() for x in scene[:5]]
     v_image = torch.randn(height, width, scene.colors.shape[1], device=scene.means.device)
 
@@ -164,32 +170,66 @@ def measure(scene: Scene, copy_GBps: float) -> dict[str, Any]:
     def both() -> tuple[Tensor, ...]:
         return torch.autograd.grad(forward(), leaves, v_image)
 
-    projected = (scene.means, scene.quats, scene.scales, None, scene.opacities, viewmats, Ks, width, height, camera.model, camera.near,
-                 camera.far, 0.3, False)
+    stages, visible, hits = stage_calls(scene)
     with torch.no_grad():
-        p = ops.project(*projected)
-        bins = ops.bin_splats(p.means2d, p.radii, p.conics, scene.opacities[None], p.depths, width, height, 16)
-        splats = p.means2d, p.conics, scene.opacities[None], scene.colors[None], scene.background[None]
-        lists = bins.ids, bins.offsets, width, height, 16, 0.99
-        stages = {
-            "project": milliseconds(lambda: ops.project(*projected)),
-            "bin": milliseconds(lambda: ops.bin_splats(p.means2d, p.radii, p.conics, scene.opacities[None], p.depths, width, height, 16)),
-            "blend": milliseconds(lambda: ops.blend(*splats, None, *lists)),
-        }
-        stages["forward"] = milliseconds(forward)
-    stages["both"] = milliseconds(both)
+        ms = {name: milliseconds(call) for name, call in stages.items()}
+        ms["forward"] = milliseconds(forward)
+    ms["both"] = milliseconds(both)
     torch.cuda.reset_peak_memory_stats()
     before = torch.cuda.memory_allocated()
     both()
-    visible, hits, N = int((p.radii > 0).all(-1).sum()), len(bins.ids), len(scene.means)
+    N = len(scene.means)
     floors = {"project": 4 * (14 * N + 11 * visible), "bin": 24 * visible + 3 * 12 * hits,
               "blend": 52 * hits + 4 * (scene.colors.shape[1] + 1) * width * height}
-    row: dict[str, Any] = {"ms": stages, "peak_MiB": (torch.cuda.max_memory_allocated() - before) / 2**20, "visible": visible, "hits": hits,
-                           "share_of_memory_floor": {k: v / copy_GBps / 1e6 / stages[k][0] for k, v in floors.items()}}
-    row["graph_project_ms"] = graph_time(lambda: ops.project(*projected))
-    row["graph_blend_ms"] = graph_time(lambda: ops.blend(*splats, None, *lists))
+    row: dict[str, Any] = {"ms": ms, "peak_MiB": (torch.cuda.max_memory_allocated() - before) / 2**20, "visible": visible, "hits": hits,
+                           "share_of_memory_floor": {k: v / copy_GBps / 1e6 / ms[k][0] for k, v in floors.items()}}
+    row["graph_ms"] = {name: graph_time(stages[name]) for name in ("project", "blend", "blend_backward")}
     row["gsplat"] = measure_gsplat(scene, leaves, v_image, forward().detach(), both())
     return row
+
+
+def stage_calls(scene: Scene) -> tuple[dict[str, Callable[[], object]], int, int]:
+    """Each stage as a call on fixed inputs, and the numbers of visible splats and of hits."""
+    camera, width, height = scene.camera, scene.camera.width, scene.camera.height
+    shape = scene.means, scene.quats, scene.scales, None
+    matrices, planes = (camera.viewmats[None], camera.Ks[None], width, height, camera.model), (camera.near, camera.far, 0.3, False)
+    with torch.no_grad():
+        p = ops.project(*shape, scene.opacities, *matrices, *planes)
+        to_bin = p.means2d, p.radii, p.conics, scene.opacities[None], p.depths, width, height, 16
+        bins = ops.bin_splats(*to_bin)
+        splats = p.means2d, p.conics, scene.opacities[None], scene.colors[None], scene.background[None]
+        lists, options = (bins.ids, bins.offsets), (width, height, 16, 0.99)
+        outputs = ops.blend(*splats, None, *lists, *options)
+        upstream = [torch.randn_like(x) for x in outputs]
+        v = [torch.randn_like(x) for x in (p.means2d, p.depths, p.conics, p.compensations)]
+    calls: dict[str, Callable[[], object]] = {
+        "project": lambda: ops.project(*shape, scene.opacities, *matrices, *planes),
+        "bin": lambda: ops.bin_splats(*to_bin),
+        "blend": lambda: ops.blend(*splats, None, *lists, *options),
+        "blend_backward": lambda: blend_backward_op(*splats, *lists, *outputs, *upstream, *options, False),
+        "project_backward": lambda: project_backward_op(*shape, scene.opacities, *matrices, *planes, p.radii, *v),
+    }
+    return calls, int((p.radii > 0).all(-1).sum()), len(bins.ids)
+
+
+def profile(scene: Scene) -> str:
+    """The kernels of a forward and backward, ours and gsplat's, with their times."""
+    leaves = [x.clone().requires_grad_() for x in scene[:5]]
+    renderers: dict[str, Callable[[], Tensor]] = {
+        "tsplat": lambda: tsplat.rasterize(*leaves, scene.camera, background=scene.background).image}
+    if (peer := gsplat_renderer(scene, leaves)) is not None:
+        renderers["gsplat"] = peer
+    text = ""
+    for name, render in renderers.items():
+        for _ in range(3):
+            torch.autograd.grad(render().sum(), leaves)
+        with torch.profiler.profile() as p:
+            for _ in range(5):
+                torch.autograd.grad(render().sum(), leaves)
+            torch.cuda.synchronize()
+        rows = sorted((e for e in p.key_averages() if e.device_type.name == "CUDA"), key=lambda e: -e.self_device_time_total)
+        text += f"{name}\n" + "".join(f"{e.self_device_time_total / 5e3:9.4f} ms {e.count // 5:3d}x {e.key[:110]}\n" for e in rows[:24])
+    return text
 
 
 def graph_time(run: Callable[[], object]) -> float:
@@ -206,18 +246,22 @@ def graph_time(run: Callable[[], object]) -> float:
         return milliseconds(graph.replay)[0]
 
 
-def measure_gsplat(scene: Scene, leaves: list[Tensor], v_image: Tensor, image: Tensor, gradients: tuple[Tensor, ...]) -> dict[str, Any]:
-    """The peer on the same inputs; `worst_*` compare its results with ours."""
+def gsplat_renderer(scene: Scene, leaves: list[Tensor]) -> Callable[[], Tensor] | None:
+    """gsplat's image of the leaves, if gsplat is there."""
     try:
         from gsplat import rasterization
-    except Exception as error:
-        return {"missing": f"{type(error).__name__}: {error}"}
+    except ImportError:
+        return None
     camera = scene.camera
-    means, quats, scales, opacities, colors = leaves
+    matrices = camera.viewmats[None], camera.Ks[None], camera.width, camera.height
+    return lambda: rasterization(*leaves, *matrices, backgrounds=scene.background[None], packed=False)[0][0]
 
-    def forward() -> Tensor:
-        return rasterization(means, quats, scales, opacities, colors, camera.viewmats[None], camera.Ks[None], camera.width, camera.height,
-                             backgrounds=scene.background[None], packed=False)[0][0]
+
+def measure_gsplat(scene: Scene, leaves: list[Tensor], v_image: Tensor, image: Tensor, gradients: tuple[Tensor, ...]) -> dict[str, Any]:
+    """The peer on the same inputs, and how its results differ from ours."""
+    forward = gsplat_renderer(scene, leaves)
+    if forward is None:
+        return {"missing": "gsplat cannot be imported"}
 
     def both() -> tuple[Tensor, ...]:
         return torch.autograd.grad(forward(), leaves, v_image)

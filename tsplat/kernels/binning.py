@@ -10,9 +10,8 @@ import triton.language as tl
 from torch import Tensor
 from tsplat_reference.constants import ALPHA_MIN, BIN_SLACK, BIN_SLACK_RELATIVE, EXTENT_MAX
 
-from tsplat.kernels.launch import ceil_div
+from tsplat.kernels.launch import ceil_div, launch
 
-BLOCK = 64
 LOG_MIN = tl.constexpr(math.log(ALPHA_MIN))
 LEVEL_MAX = tl.constexpr(EXTENT_MAX**2)
 SLACK = tl.constexpr(BIN_SLACK)
@@ -130,10 +129,11 @@ class _Splats:
         order = depths.flatten().sort(stable=True).indices.to(torch.int32)                  # a radix sort of 4 passes
         visible = (radii > 0).all(-1).flatten().to(torch.uint8)
         self.splats = order, visible, means2d.contiguous(), conics.contiguous(), opacities.contiguous()
-        self.options = {"EPS": torch.finfo(means2d.dtype).eps, "TILE": tile, "BLOCK": BLOCK, "enable_fp_fusion": True}
+        self.options = {"EPS": torch.finfo(means2d.dtype).eps, "TILE": tile, **launch("bin"), "enable_fp_fusion": True}
+        self.programs = ceil_div(self.R, self.options["BLOCK"])
         self.counts = torch.empty(self.R, dtype=torch.int32, device=means2d.device)
         if self.R:
-            count_kernel[(ceil_div(self.R, BLOCK),)](*self.splats, self.counts, self.R, *self.size, **self.options)
+            count_kernel[(self.programs,)](*self.splats, self.counts, self.R, *self.size, **self.options)
         self.ends = self.counts.cumsum(0)                                                   # int64: more than 2^31 hits are counted right
 
     def bins(self, capacity: int) -> tuple[Tensor, Tensor]:
@@ -143,7 +143,7 @@ class _Splats:
         keys = torch.full((capacity,), self.tiles, dtype=narrow, device=device)
         ids = torch.zeros(capacity, dtype=torch.int32, device=device)
         if self.R and capacity:
-            emit_kernel[(ceil_div(self.R, BLOCK),)](*self.splats, self.ends, self.counts, keys, ids, self.R, self.N, *self.size, *self.grid,
+            emit_kernel[(self.programs,)](*self.splats, self.ends, self.counts, keys, ids, self.R, self.N, *self.size, *self.grid,
                                                     capacity, **self.options)
         keys, by_tile = keys.sort(stable=True)                                              # int16 keys: 2 passes
         offsets = torch.searchsorted(keys, torch.arange(self.tiles + 1, device=device, dtype=narrow))

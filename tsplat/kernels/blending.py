@@ -17,18 +17,10 @@ from torch import Tensor
 from tsplat.kernels import footprint
 from tsplat.kernels.feature_blending import feature_bwd_kernel, feature_fwd_kernel
 from tsplat.kernels.footprint import LOG2_MIN, T_MIN, TILE
-from tsplat.kernels.launch import ceil_div, current_target
+from tsplat.kernels.launch import ceil_div, current_target, launch
 
 CHANNELS = 4
 """Up to here a splat's colour is in its record and a pixel's in registers."""
-UNROLL = 8
-"""Splats between two looks at whether the tile is finished, in the forward."""
-CHECK = 8
-"""The same in the backward, where it is a loop."""
-PACK = 128
-FEATURE_PIXELS, FEATURE_SPLATS, FEATURE_WARPS = 64, 16, 8
-FEATURE_CHANNELS, FEATURE_CHANNELS_BACKWARD = 32, 16
-"""Of the matrix products: the largest sizes that do not spill on any target."""
 SUMS = 16
 """Row of sums per splat in the backward: 6 moments, 4 colours, 2 absolute gradients, 4 that pad it to 64 bytes."""
 
@@ -328,16 +320,16 @@ class _Scene:
         self.grid = ceil_div(width, tile), ceil_div(height, tile)
         self.tiles = self.C * self.grid[0] * self.grid[1]
         self.records = means2d.new_empty(self.R + 1, footprint.RECORD)
-        footprint.pack_kernel[(ceil_div(self.R + 1, PACK),)](
+        options = launch("records")
+        footprint.pack_kernel[(ceil_div(self.R + 1, options["BLOCK"]),)](
             means2d.contiguous(), self.conics, self.opacities, self.colors, self.records, self.R, max(self.rows, 1),
-            D=self.D if self.D <= CHANNELS else 0, BLOCK=PACK)
+            D=self.D if self.D <= CHANNELS else 0, **options)
         target = current_target()
         self.common = {"ALPHA_MAX": alpha_max, "log2_alpha": footprint.log2_alpha, "enable_fp_fusion": True}
         lanes, ptx = target.lanes, target.ptx and means2d.dtype == torch.float32
         self.lane_x = _lane_x(tile, lanes, means2d.dtype, means2d.device)
-        self.warp = {**self.common, "D": self.D, "LANES": lanes, "PX": tile * tile // lanes, "PTX": ptx, "num_warps": 1}
-        self.block = {**self.common, "P": FEATURE_PIXELS, "K": FEATURE_SPLATS, "PRECISION": "tf32x3" if ptx else "ieee",
-                      "num_warps": FEATURE_WARPS}
+        self.warp = {**self.common, "D": self.D, "LANES": lanes, "PX": tile * tile // lanes, "PTX": ptx}
+        self.block = {**self.common, "PRECISION": "tf32x3" if ptx else "ieee"}
 
 
 def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor, offsets: Tensor,
@@ -348,11 +340,12 @@ def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ba
     has_background = backgrounds is not None
     if s.D <= CHANNELS:
         blend_fwd_kernel[(s.tiles,)](s.records, ids, offsets, s.backgrounds, image, alphas, s.lane_x, width, height, *s.grid, s.R,
-                                     BACKGROUND=has_background, UNROLL=UNROLL, **s.warp)
+                                     BACKGROUND=has_background, **launch("blend"), **s.warp)
     else:
-        feature_fwd_kernel[(s.tiles * (tile * tile // FEATURE_PIXELS), ceil_div(s.D, FEATURE_CHANNELS))](
+        options = launch("features")
+        feature_fwd_kernel[(s.tiles * (tile * tile // options["P"]), ceil_div(s.D, options["DB"]))](
             s.records, s.colors, ids, offsets, s.backgrounds, image, alphas, width, height, *s.grid, s.R, max(s.rows, 1), s.D,
-            BACKGROUND=has_background, DB=FEATURE_CHANNELS, **s.block)
+            BACKGROUND=has_background, **options, **s.block)
     return image, alphas
 
 
@@ -375,8 +368,8 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
     if s.D <= CHANNELS:
         blend_bwd_kernel[(s.tiles,)](s.records, ids, offsets, s.backgrounds, image, alphas, v_image, v_alphas, sums, s.lane_x, width,
                                      height, *s.grid, BACKGROUND=backgrounds is not None, ABSGRAD=absgrad, PER_HIT=deterministic,
-                                     CHECK=CHECK,
-                                     lane_moments=footprint.lane_moments, mean_slopes=footprint.mean_slopes, **s.warp)
+                                     lane_moments=footprint.lane_moments, mean_slopes=footprint.mean_slopes,
+                                     **launch("blend_backward"), **s.warp)
         if deterministic:
             sums = means2d.new_zeros(s.R + 1, SUMS).index_add_(0, ids.long(), sums)
         v_colors = sums[:s.R, 6:6 + s.D].view(s.C, s.N, s.D)
@@ -384,13 +377,15 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
     else:
         behind = 0.0 if backgrounds is None else torch.einsum("chwd,cd->chw", v_image, backgrounds)
         rest = torch.einsum("chwd,chwd->chw", image, v_image) + alphas * v_alphas - behind
-        feature_bwd_kernel[(s.tiles * (tile * tile // FEATURE_PIXELS),)](
+        options = launch("features_backward")
+        feature_bwd_kernel[(s.tiles * (tile * tile // options["P"]),)](
             s.records, s.colors, ids, offsets, rest, v_alphas - behind, v_image, sums, v_colors, width, height, *s.grid, s.R,
-            max(s.rows, 1), s.D, DB=FEATURE_CHANNELS_BACKWARD, ABSGRAD=absgrad,
-            block_moments=footprint.block_moments, mean_slopes=footprint.mean_slopes, **s.block)
+            max(s.rows, 1), s.D, ABSGRAD=absgrad,
+            block_moments=footprint.block_moments, mean_slopes=footprint.mean_slopes, **options, **s.block)
     v_means2d, v_conics, v_opacities = torch.empty_like(means2d), torch.empty_like(s.conics), torch.empty_like(s.opacities)
-    footprint.unpack_kernel[(max(1, ceil_div(s.R, PACK)),)](sums, s.conics, s.opacities, v_means2d, v_conics, v_opacities, s.R, STRIDE=SUMS,
-                                                            BLOCK=PACK)
+    options = launch("records")
+    footprint.unpack_kernel[(max(1, ceil_div(s.R, options["BLOCK"])),)](sums, s.conics, s.opacities, v_means2d, v_conics, v_opacities, s.R,
+                                                                        STRIDE=SUMS, **options)
     v_backgrounds = v_image.new_zeros(s.C, s.D) if backgrounds is None else torch.einsum("chwd,chw->cd", v_image, 1 - alphas)
     v_abs = (2 * math.log(2) * sums[:s.R, 10:12]).view(s.C, s.N, 2) if absgrad else means2d.new_empty(s.C, 0, 2)
     return v_means2d, v_conics, v_opacities, v_colors, v_backgrounds, v_abs

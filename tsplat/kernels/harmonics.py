@@ -255,12 +255,12 @@ def harmonics(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask:
     out = coeffs.new_empty(C, N, D)
     if out.numel() == 0:
         return out
-    block, num_warps = launch("harmonics")
+    options = launch("harmonics")
     channels, chunk = _group(K, D, degree)
     with on_device_of(means):
-        harmonics_fwd_kernel[(ceil_div(N, block), D // channels)](
+        harmonics_fwd_kernel[(ceil_div(N, options["BLOCK"]), D // channels)](
             means.contiguous(), centers.contiguous(), coeffs.contiguous(), mask.contiguous(), out, N, C, K=K, D=D, DEGREE=degree,
-            CHANNELS=channels, CHUNK=chunk, BLOCK=block, num_warps=num_warps, enable_fp_fusion=True)
+            CHANNELS=channels, CHUNK=chunk, **options, enable_fp_fusion=True)
     return out
 
 
@@ -271,16 +271,16 @@ def harmonics_backward(means: Tensor, centers: Tensor, coeffs: Tensor, degree: i
     means, centers, coeffs = means.contiguous(), centers.contiguous(), coeffs.contiguous()
     if v_out.numel() == 0:
         return torch.zeros_like(means), torch.zeros_like(centers), torch.zeros_like(coeffs)
-    block, num_warps = launch("harmonics_backward")
+    options = launch("harmonics_backward")
     channels, chunk = _group(K, D, degree)
-    programs, groups = ceil_div(N, block), D // channels
+    programs, groups = ceil_div(N, options["BLOCK"]), D // channels
     v_coeffs = torch.empty_like(coeffs) if (degree + 1) ** 2 == K else torch.zeros_like(coeffs)
     v_means = means.new_empty(groups, N, 3)
     partial_centers = means.new_empty(groups * programs, C, 4)
     with on_device_of(means):
         harmonics_bwd_kernel[(programs, groups)](
             means, centers, coeffs, mask.contiguous(), v_out.contiguous(), v_means, v_coeffs, partial_centers, N, C, K=K, D=D,
-            DEGREE=degree, CHANNELS=channels, CHUNK=chunk, BLOCK=block, num_warps=num_warps, enable_fp_fusion=True)
+            DEGREE=degree, CHANNELS=channels, CHUNK=chunk, **options, enable_fp_fusion=True)
     if degree == 0:
         return torch.zeros_like(means), torch.zeros_like(centers), v_coeffs
     return v_means[0] if groups == 1 else v_means.sum(0), -partial_centers.sum(0)[:, :3], v_coeffs

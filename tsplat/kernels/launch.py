@@ -1,14 +1,15 @@
-"""Launch constants and what the launchers share. No autotune: constants are measured in `bench/` and stand here."""
+"""Launch constants and what the launchers share. No autotune: constants are measured by `bench/sweep.py` and stand here."""
 
 from __future__ import annotations
 
 import contextlib
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 import triton
 from torch import Tensor
+
+FAMILIES = ("nvidia", "cdna", "rdna")
 
 
 @dataclass(frozen=True)
@@ -37,25 +38,30 @@ def ceil_div(a: int, b: int) -> int:
     return -(-a // b)
 
 
-class Launch(NamedTuple):
-    """Splats per program, and warps."""
-
-    block: int
-    num_warps: int
+def _splats(block: int, num_warps: int) -> dict[str, int]:
+    return {"BLOCK": block, "num_warps": num_warps}
 
 
-# A splat per thread in all of these, so that no thread repeats another's work. As few warps as can be where there are sums over the block:
+# project, harmonics: a splat per thread, so that no thread repeats another's work. As few warps as can be where there are sums over the block:
 # one needs no step from warp to warp, and sums of more blocks to add up are a percent or two of what is read anyway. (project_backward in one
 # warp is compiled for 96 registers on sm_89, and spills.)
-LAUNCHES = {
-    "project": {"nvidia": Launch(128, 4), "cdna": Launch(128, 2), "rdna": Launch(128, 4)},
-    "project_backward": {"nvidia": Launch(64, 2), "cdna": Launch(64, 1), "rdna": Launch(32, 1)},
-    "harmonics": {"nvidia": Launch(128, 4), "cdna": Launch(128, 2), "rdna": Launch(128, 4)},
-    "harmonics_backward": {"nvidia": Launch(32, 1), "cdna": Launch(64, 1), "rdna": Launch(32, 1)},
+# blend: splats between two looks at whether the tile is finished. Features: pixels, splats and channels of a matrix product, the largest that
+# spill on no target.
+LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
+    "project": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
+    "project_backward": {"nvidia": _splats(64, 2), "cdna": _splats(64, 1), "rdna": _splats(32, 1)},
+    "harmonics": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
+    "harmonics_backward": {"nvidia": _splats(32, 1), "cdna": _splats(64, 1), "rdna": _splats(32, 1)},
+    "bin": {"nvidia": _splats(64, 2), "cdna": _splats(64, 1), "rdna": _splats(64, 2)},
+    "records": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
+    "blend": {family: {"UNROLL": 8, "num_warps": 1} for family in FAMILIES},
+    "blend_backward": {family: {"CHECK": 8, "num_warps": 1} for family in FAMILIES},
+    "features": {family: {"P": 64, "K": 16, "DB": 32, "num_warps": 8} for family in FAMILIES},
+    "features_backward": {family: {"P": 64, "K": 16, "DB": 16, "num_warps": 8} for family in FAMILIES},
 }
 
 
-def launch(kernel: str) -> Launch:
+def launch(kernel: str) -> dict[str, int]:
     """The constants of a kernel for the current target."""
     return LAUNCHES[kernel][current_target().family]
 

@@ -304,13 +304,13 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
     radii = means.new_empty(C, N, 2, dtype=torch.int32)
     means2d, depths, conics, compensations = (means.new_empty(C, N, *s) for s in ((2,), (), (3,), ()))
     if C * N > 0:
-        block, num_warps = launch("project")
+        options = launch("project")
         with on_device_of(means):
-            project_fwd_kernel[(ceil_div(N, block) * C,)](
+            project_fwd_kernel[(ceil_div(N, options["BLOCK"]) * C,)](
                 means.contiguous(), *map(_contiguous, (quats, scales, covars)), opacities.contiguous(), viewmats.contiguous(),
                 Ks.contiguous(), radii, means2d, depths, conics, compensations, N, C, width, height, near, far, eps2d, MODEL=model,
                 ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, ALPHA_MIN=ALPHA_MIN, EXTENT_MAX=EXTENT_MAX,
-                LARGEST=LARGEST, BLOCK=block, num_warps=num_warps, enable_fp_fusion=True)
+                LARGEST=LARGEST, **options, enable_fp_fusion=True)
     return radii, means2d, depths, conics, compensations
 
 
@@ -326,14 +326,14 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
     v_means, (v_quats, v_scales, v_covars) = new(means), (None if x is None else new(x) for x in (quats, scales, covars))
     v_viewmats, v_Ks = torch.zeros_like(viewmats), torch.zeros_like(Ks)
     if C * N > 0:
-        block, num_warps = launch("project_backward")
-        partials = means.new_empty(ceil_div(N, block), C, SUMS)
+        options = launch("project_backward")
+        partials = means.new_empty(ceil_div(N, options["BLOCK"]), C, SUMS)
         with on_device_of(means):
             project_bwd_kernel[(len(partials),)](
                 means, quats, scales, covars, viewmats, Ks, radii.contiguous(), v_means2d.contiguous(), v_depths.contiguous(),
                 v_conics.contiguous(), v_compensations.contiguous(), v_means, v_quats, v_scales, v_covars, partials, N, C, width, height,
                 eps2d, MODEL=model, ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, LARGEST=LARGEST, SUMS=SUMS,
-                BLOCK=block, num_warps=num_warps, enable_fp_fusion=True)
+                **options, enable_fp_fusion=True)
         sums = partials.sum(0)                          # [C, SUMS]
         v_viewmats[:, :3] = sums[:, :12].view(C, 3, 4)
         v_Ks.diagonal(0, 1, 2)[:, :2] = sums[:, 12:14]

@@ -195,10 +195,10 @@ def stage_calls(scene: Scene) -> tuple[dict[str, Callable[[], object]], int, int
     matrices, planes = (camera.viewmats[None], camera.Ks[None], width, height, camera.model), (camera.near, camera.far, 0.3, False)
     with torch.no_grad():
         p = ops.project(*shape, scene.opacities, *matrices, *planes)
-        to_bin = p.means2d, p.radii, p.conics, scene.opacities[None], p.depths, width, height, 16
+        to_bin = p.means2d, p.radii, p.conics, scene.opacities[None], p.depths, width, height, 8
         bins = ops.bin_splats(*to_bin)
         splats = p.means2d, p.conics, scene.opacities[None], scene.colors[None], scene.background[None]
-        lists, options = (bins.ids, bins.offsets), (width, height, 16, 0.99)
+        lists, options = (bins.ids, bins.offsets), (width, height, 8, 0.99)
         outputs = ops.blend(*splats, None, *lists, *options)
         upstream = [torch.randn_like(x) for x in outputs]
         v = [torch.randn_like(x) for x in (p.means2d, p.depths, p.conics, p.compensations)]

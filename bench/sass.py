@@ -81,7 +81,7 @@ def launch_everything(quick: bool) -> Iterator[tuple[str, Any]]:
 
     cameras = t(C, 4, 4), t(C, 3, 3)
     radii, splats = t(C, N, 2, dtype=torch.int32), (t(C, N, 2), t(C, N, 3), t(C, N))
-    ids, offsets = t(5000, dtype=torch.int32), t(C * 40 * 30 + 1, dtype=torch.int64)
+    ids, offsets = t(5000, dtype=torch.int32), t(C * 80 * 60 + 1, dtype=torch.int64)
     for model in ("pinhole",) if quick else ("pinhole", "orthographic", "fisheye"):
         for covars in (None,) if quick else (None, t(N, 3, 3)):
             shape = (None, None, covars) if covars is not None else (t(N, 4), t(N, 3), None)
@@ -95,14 +95,14 @@ def launch_everything(quick: bool) -> Iterator[tuple[str, Any]]:
         coeffs = t(N, (degree + 1) ** 2, 3)
         yield f"degree {degree}", lambda d=degree, k=coeffs, m=mask: harmonics.harmonics(t(N, 3), t(C, 3), k, d, m)
         yield f"degree {degree}", lambda d=degree, k=coeffs, m=mask: harmonics.harmonics_backward(t(N, 3), t(C, 3), k, d, m, t(C, N, 3))
-    yield "", lambda: binning.bin_splats_fixed(splats[0], radii, splats[1], splats[2], t(C, N), W, H, 16, 5000)
+    yield "", lambda: binning.bin_splats_fixed(splats[0], radii, splats[1], splats[2], t(C, N), W, H, 8, 5000)
     every = ((1, False), (3, False), (3, True), (4, False), (32, False), (128, False))
     for D, absgrad in (every[1], every[4]) if quick else every:
         colors, images = t(1, N, D), (t(C, H, W, D), t(C, H, W))
         label = f"{D} channels{', absgrad' if absgrad else ''}"
-        yield label, lambda c=colors, D=D: blending.blend(*splats, c, t(C, D), ids, offsets, W, H, 16, 0.99)
+        yield label, lambda c=colors, D=D: blending.blend(*splats, c, t(C, D), ids, offsets, W, H, 8, 0.99)
         yield label, lambda c=colors, D=D, i=images, a=absgrad: blending.blend_backward(
-            *splats, c, t(C, D), ids, offsets, *i, *i, W, H, 16, 0.99, a)
+            *splats, c, t(C, D), ids, offsets, *i, *i, W, H, 8, 0.99, a)
 
 
 class Usage(NamedTuple):

@@ -16,7 +16,7 @@ pytest.importorskip("triton", reason="Triton is not installed here")
 
 from tsplat.kernels import binning, blending
 
-TILE = 16
+TILE = 8
 ALPHA_MAX = 0.99
 
 
@@ -116,8 +116,8 @@ def test_float32_is_as_close_as_its_rounding() -> None:
 
 def test_another_tile_raises() -> None:
     c = case(1, 2, 8, 8, device=DEVICE)
-    with pytest.raises(ValueError, match="tile: expected 16"):
-        blending.blend(*c.arguments[:-2], 8, ALPHA_MAX)
+    with pytest.raises(ValueError, match="tile: expected 8"):
+        blending.blend(*c.arguments[:-2], 16, ALPHA_MAX)
 
 
 BINNED = {"batch": (3, 40, 70, 41, {}), "large splats": (1, 10, 100, 37, {"size": (10.0, 40.0)}), "nothing": (1, 0, 20, 20, {}),

@@ -38,7 +38,7 @@ def render(*inputs: Tensor, width: int = WIDTH, height: int = HEIGHT) -> tuple[T
     """Everything at once: SH colours, a batch of cameras, background, depth, antialiasing."""
     means, quats, scales, opacities, sh, viewmats, Ks, background = inputs
     r = tsplat.rasterize(means, quats, scales, opacities, sh, tsplat.Camera(viewmats, Ks, width, height), sh_degree=2,
-                         background=background, depth="expected", antialiased=True, tile=16)
+                         background=background, depth="expected", antialiased=True, tile=8)
     assert r.depth is not None
     return r.image, r.alpha, r.depth
 

@@ -1,7 +1,8 @@
-"""Blending of up to 4 channels: one warp per tile, several pixels per thread, front to back; forward and backward.
+"""Blending of up to 4 channels: a warp takes 4 tiles of 8 x 8 pixels, a lane a row of its tile, front to back; forward and backward.
 
-Loads, row terms and reductions are shared by the pixels of a thread; there is no shared memory and no barrier. More channels go through
-matrix products, in `feature_blending.py`.
+Loads, row terms and reductions are shared by the 8 pixels of a lane; there is no shared memory and no barrier. Small tiles halve the pairs
+of splat and pixel in vain, and a warp that takes 4 of them still works in all lanes, as the 4 lists are of about the same length. More
+channels go through matrix products, in `feature_blending.py`.
 """
 
 from __future__ import annotations
@@ -27,65 +28,70 @@ SUMS = 16
 
 @triton.jit
 def load4(p):
-    """Four consecutive numbers as scalars: one 16-byte load, no shuffles."""
-    a, b = tl.split(tl.reshape(tl.load(p + tl.arange(0, 4)), (2, 2)))
+    """Four consecutive numbers at each pointer `[LANES, 1]`, each `[LANES, 1]`: one 16-byte load, no shuffles."""
+    a, b = tl.split(tl.reshape(tl.load(p + tl.arange(0, 4)[None, :]), (p.shape[0], 2, 2)))
     v0, v2 = tl.split(a)
     v1, v3 = tl.split(b)
-    return v0, v1, v2, v3
+    return v0[:, None], v1[:, None], v2[:, None], v3[:, None]
 
 
 @triton.jit
-def glue(a, b, PX: tl.constexpr):
-    """The pixels of a lane `[LANES, PX]`: even ones from a, odd ones from b, or all from a if a lane has 4.
-
-    A load gives a thread 4 numbers at the most; only so are 8 of them in the registers of one thread.
-    """
-    if PX == 8:
-        return tl.reshape(tl.join(a, b), (a.shape[0], 8))
-    else:
-        return a
+def glue(a, b):
+    """A lane's 8 pixels `[LANES, 8]`: even ones from a, odd ones from b. (A load gives a thread 4 numbers at the most; only so are 8 of them
+    in the registers of one thread.)"""
+    return tl.reshape(tl.join(a, b), (a.shape[0], 8))
 
 
 @triton.jit
-def tile_pixels(tile, lane_x, tiles_x, tiles_y, W, H, LANES: tl.constexpr, PX: tl.constexpr):
-    """The pixels of a tile: camera, x `[LANES, PX]` and y `[LANES, 1]` about the tile's centre, that centre, and of 4 pixels of each lane
-    `[LANES, 4]` (all of them, or every second of 8) the column and the index of the pixel.
+def tile_pixels(block, lane_x, tiles_x, tiles_y, W, H, LANES: tl.constexpr):
+    """The tiles of a block, 2 in each row of it, and a lane's pixels: camera, tile and whether it exists `[LANES, 1]`, x `[LANES, 8]` and
+    y `[LANES, 1]` about the tile's centre, that centre `[LANES, 1]`, and of every second pixel the column and the index `[LANES, 4]`.
 
     x is loaded rather than made by tl.arange: that anchors the layout with a lane's pixels in its own registers, and all state is derived
     from it (tl.zeros would get another layout and the compiler would run the loop twice).
     """
-    view = tile // (tiles_x * tiles_y)
-    left = (tile % tiles_x) * TILE
-    top = (tile // tiles_x) % tiles_y * TILE
-    half: tl.constexpr = TILE / 2
+    HIGH: tl.constexpr = LANES // (2 * TILE)
+    blocks_x = (tiles_x + 1) // 2
+    blocks_y = (tiles_y + HIGH - 1) // HIGH
+    view = block // (blocks_x * blocks_y)
     x4 = tl.load(lane_x + tl.arange(0, LANES)[:, None] * 4 + tl.arange(0, 4)[None, :])
-    row = (tl.arange(0, LANES) % TILE)[:, None]
-    column4 = left + (x4 + (half - 0.5)).to(tl.int32)
-    column4 = tl.where(top + row < H, column4, W)       # beyond the border, if the row is
-    pixel4 = (view.to(tl.int64) * H + top + row) * W + column4
-    x = glue(x4, x4 + 1.0, PX)
-    return view, x, row.to(x.dtype) - (half - 0.5), left.to(x.dtype) + half, top.to(x.dtype) + half, column4, pixel4
+    lane = tl.arange(0, LANES)[:, None]
+    tile_x = block % blocks_x * 2 + lane // TILE % 2
+    tile_y = block // blocks_x % blocks_y * HIGH + lane // (2 * TILE)
+    row = lane % TILE
+    half: tl.constexpr = TILE / 2
+    y = tile_y * TILE + row
+    column4 = tile_x * TILE + (x4 + (half - 0.5)).to(tl.int32)
+    column4 = tl.where(y < H, column4, W)               # beyond the border, if the row is
+    pixel4 = (view.to(tl.int64) * H + y) * W + column4
+    exists = (tile_x < tiles_x) & (tile_y < tiles_y)
+    tile = (view.to(tl.int64) * tiles_y + tile_y) * tiles_x + tile_x
+    dt: tl.constexpr = x4.dtype
+    return (view, tile, exists, glue(x4, x4 + 1.0), row.to(dt) - (half - 0.5), (tile_x * TILE).to(dt) + half, (tile_y * TILE).to(dt) + half,
+            column4, pixel4)
 
 
 @triton.jit
-def load_pixels(p, pixel4, column4, W, D: tl.constexpr, c: tl.constexpr, PX: tl.constexpr):
+def load_pixels(p, pixel4, column4, W, D: tl.constexpr, c: tl.constexpr):
     """Channel c of an image `[C, H, W, D]` at a tile's pixels; zeros beyond the border and for channels that do not exist."""
     a = tl.load(p + pixel4 * D + c, mask=(column4 < W) & (c < D), other=0.0)
-    if PX == 8:
-        return glue(a, tl.load(p + pixel4 * D + (D + c), mask=(column4 + 1 < W) & (c < D), other=0.0), PX)
-    else:
-        return a
+    return glue(a, tl.load(p + pixel4 * D + (D + c), mask=(column4 + 1 < W) & (c < D), other=0.0))
 
 
 @triton.jit
-def store_pixels(p, value, pixel4, column4, W, D: tl.constexpr, c: tl.constexpr, PX: tl.constexpr):
+def store_pixels(p, value, pixel4, column4, W, D: tl.constexpr, c: tl.constexpr):
     """The inverse of `load_pixels`."""
-    if PX == 8:
-        a, b = tl.split(tl.reshape(value, (value.shape[0], 4, 2)))
-        tl.store(p + pixel4 * D + c, a, mask=column4 < W)
-        tl.store(p + pixel4 * D + (D + c), b, mask=column4 + 1 < W)
-    else:
-        tl.store(p + pixel4 * D + c, value, mask=column4 < W)
+    a, b = tl.split(tl.reshape(value, (value.shape[0], 4, 2)))
+    tl.store(p + pixel4 * D + c, a, mask=column4 < W)
+    tl.store(p + pixel4 * D + (D + c), b, mask=column4 + 1 < W)
+
+
+@triton.jit
+def tile_list(offsets, tile, exists):
+    """Where each lane's list begins, its length, and the length of the longest of the block."""
+    start = tl.load(offsets + tile, mask=exists, other=0)
+    hits = (tl.load(offsets + tile + 1, mask=exists, other=0) - start).to(tl.int32)      # 64 bits are for the start only
+    return start, hits, tl.max(tl.max(hits, 1), 0)
 
 
 @triton.jit
@@ -116,21 +122,19 @@ def splat_alpha(p, x, y, cx, cy, T, log2_alpha: tl.constexpr,
 
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null"])
 def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, W, H, tiles_x, tiles_y, null, D: tl.constexpr,
-                     BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, LANES: tl.constexpr, PX: tl.constexpr,
+                     BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, LANES: tl.constexpr,
                      UNROLL: tl.constexpr, PTX: tl.constexpr):
-    """Image `[C, H, W, D]` and alpha `[C, H, W]` of one tile."""
-    tile = tl.program_id(0)
-    view, x, y, cx, cy, column4, pixel4 = tile_pixels(tile, lane_x, tiles_x, tiles_y, W, H, LANES, PX)
-    T = glue(tl.where(column4 < W, 1.0, 0.0), tl.where(column4 + 1 < W, 1.0, 0.0), PX) + x * 0.0     # beyond the border finished
+    """Image `[C, H, W, D]` and alpha `[C, H, W]` of a block of tiles."""
+    view, tile, exists, x, y, cx, cy, column4, pixel4 = tile_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
+    T = glue(tl.where(column4 < W, 1.0, 0.0), tl.where(column4 + 1 < W, 1.0, 0.0)) + x * 0.0     # beyond the border finished
     C0 = x * 0.0
     C1 = x * 0.0
     C2 = x * 0.0
     C3 = x * 0.0
-    start = tl.load(offsets + tile)
-    hits = (tl.load(offsets + tile + 1) - start).to(tl.int32)              # 64 bits are for the start only
+    start, hits, longest = tile_list(offsets, tile, exists)
     i = 0
     alive = True
-    while (i < hits) & alive:
+    while (i < longest) & alive:
         for u in tl.static_range(UNROLL):
             splat = tl.load(ids + start + i + u, mask=i + u < hits, other=null)
             p = records + splat.to(tl.int64) * 12
@@ -153,14 +157,14 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
         C1 += T * tl.load(b + 1, mask=D > 1, other=0.0)
         C2 += T * tl.load(b + 2, mask=D > 2, other=0.0)
         C3 += T * tl.load(b + 3, mask=D > 3, other=0.0)
-    store_pixels(image, C0, pixel4, column4, W, D, 0, PX)
+    store_pixels(image, C0, pixel4, column4, W, D, 0)
     if D > 1:
-        store_pixels(image, C1, pixel4, column4, W, D, 1, PX)
+        store_pixels(image, C1, pixel4, column4, W, D, 1)
     if D > 2:
-        store_pixels(image, C2, pixel4, column4, W, D, 2, PX)
+        store_pixels(image, C2, pixel4, column4, W, D, 2)
     if D > 3:
-        store_pixels(image, C3, pixel4, column4, W, D, 3, PX)
-    store_pixels(alphas, 1.0 - T, pixel4, column4, W, 1, 0, PX)
+        store_pixels(image, C3, pixel4, column4, W, D, 3)
+    store_pixels(alphas, 1.0 - T, pixel4, column4, W, 1, 0)
 
 
 @triton.jit
@@ -183,81 +187,82 @@ def fold1(a, OFFSET: tl.constexpr):
 
 
 @triton.jit
-def lane_sums(s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, COUNT: tl.constexpr, LANES: tl.constexpr, PTX: tl.constexpr):
-    """COUNT (9 or 12) sums over the lanes, spread over the lanes: value, slot and mask for one atomic instruction."""
-    lane = tl.arange(0, LANES)[:, None]
+def tile_sum(v):
+    """Sum over the lanes of each tile, in every lane of it (portable)."""
+    groups: tl.constexpr = v.shape[0] // TILE
+    total = tl.sum(tl.reshape(v, (groups, TILE)), 1, keep_dims=True)
+    return tl.reshape(tl.broadcast_to(total, (groups, TILE)), (v.shape[0], 1))
+
+
+@triton.jit
+def tile_sums(s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, COUNT: tl.constexpr, PTX: tl.constexpr):
+    """COUNT (9 or 12) sums over the 8 lanes of each tile, spread over these lanes for two atomic instructions: one of the first 8 sums with
+    its slot, and one of the others with its slot, and whether the lane has one of these."""
+    lane = tl.arange(0, s0.shape[0])[:, None]
     if PTX:
-        b4 = (lane & 16) != 0
-        b3 = (lane & 8) != 0
         b2 = (lane & 4) != 0
         b1 = (lane & 2) != 0
-        # after fold2 with bits 4, 3, 2: lanes hold sums 4 b2 + 2 b3 + b4, and 8 + 2 b3 + b4 of the last four
-        a0 = fold2(fold2(s0, s1, b4, 16), fold2(s2, s3, b4, 16), b3, 8)
-        a1 = fold2(fold2(s4, s5, b4, 16), fold2(s6, s7, b4, 16), b3, 8)
+        b0 = (lane & 1) != 0
+        slot = ((lane & 1) * 4) + (lane & 2) + ((lane >> 2) & 1)
+        a = fold2(fold2(s0, s1, b2, 4), fold2(s2, s3, b2, 4), b1, 2)
+        first = fold2(a, fold2(fold2(s4, s5, b2, 4), fold2(s6, s7, b2, 4), b1, 2), b0, 1)
         if COUNT == 9:
-            a2 = fold1(fold1(s8, 16), 8)
+            return first, slot, fold1(fold1(fold1(s8, 4), 2), 1), lane * 0 + 8, (lane & 7) == 0
         else:
-            a2 = fold2(fold2(s8, s9, b4, 16), fold2(s10, s11, b4, 16), b3, 8)
-        value = fold1(fold2(fold2(a0, a1, b2, 4), fold1(a2, 4), b1, 2), 1)
-        low = (b3.to(tl.int32) * 2) + b4.to(tl.int32)
-        slot = tl.where(b1, 8 + (0 if COUNT == 9 else 1) * low, b2.to(tl.int32) * 4 + low)
-        first = tl.where(b1, (~b2) & ((~b3) & (~b4) if COUNT == 9 else (lane >= 0)), lane >= 0)
-        return value, slot, ((lane & 1) == 0) & first
+            return first, slot, fold1(fold2(fold2(s8, s9, b2, 4), fold2(s10, s11, b2, 4), b1, 2), 1), slot + 8, (lane & 1) == 0
     else:
-        value = s0 * 0.0
-        value = tl.where(lane == 0, tl.sum(s0), value)
-        value = tl.where(lane == 1, tl.sum(s1), value)
-        value = tl.where(lane == 2, tl.sum(s2), value)
-        value = tl.where(lane == 3, tl.sum(s3), value)
-        value = tl.where(lane == 4, tl.sum(s4), value)
-        value = tl.where(lane == 5, tl.sum(s5), value)
-        value = tl.where(lane == 6, tl.sum(s6), value)
-        value = tl.where(lane == 7, tl.sum(s7), value)
-        value = tl.where(lane == 8, tl.sum(s8), value)
+        row = lane % TILE
+        first = tl.where(row == 0, tile_sum(s0), tile_sum(s1))
+        first = tl.where(row == 2, tile_sum(s2), first)
+        first = tl.where(row == 3, tile_sum(s3), first)
+        first = tl.where(row == 4, tile_sum(s4), first)
+        first = tl.where(row == 5, tile_sum(s5), first)
+        first = tl.where(row == 6, tile_sum(s6), first)
+        first = tl.where(row == 7, tile_sum(s7), first)
+        second = tile_sum(s8)
         if COUNT > 9:
-            value = tl.where(lane == 9, tl.sum(s9), value)
-            value = tl.where(lane == 10, tl.sum(s10), value)
-            value = tl.where(lane == 11, tl.sum(s11), value)
-        return value, lane, lane < COUNT
+            second = tl.where(row == 1, tile_sum(s9), second)
+            second = tl.where(row == 2, tile_sum(s10), second)
+            second = tl.where(row == 3, tile_sum(s11), second)
+        return first, row, second, row + 8, row < COUNT - 8
 
 
-@triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y"])
-def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image, v_alphas, sums, lane_x, W, H, tiles_x, tiles_y,
+@triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null"])
+def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image, v_alphas, sums, lane_x, W, H, tiles_x, tiles_y, null,
                      D: tl.constexpr, ALPHA_MAX: tl.constexpr, BACKGROUND: tl.constexpr, ABSGRAD: tl.constexpr, PER_HIT: tl.constexpr,
                      log2_alpha: tl.constexpr, lane_moments: tl.constexpr, mean_slopes: tl.constexpr, LANES: tl.constexpr,
-                     PX: tl.constexpr, CHECK: tl.constexpr, PTX: tl.constexpr):
+                     CHECK: tl.constexpr, PTX: tl.constexpr):
     """Sums `[R, 16]` over the pixels, per splat (atomic), or per hit `[M, 16]` (PER_HIT, for the same bits in every run).
 
     Front to back: `rest` is what is still to come, times the upstream gradient; it starts as <image, dL/dimage> + alpha dL/dalpha without
     the background's share, and loses a term at each splat. dL/dlog alpha = w (g - rest/T), T behind the splat: two operations less than
     w g - alpha/(1 - alpha) rest.
     """
-    tile = tl.program_id(0)
-    view, x, y, cx, cy, column4, pixel4 = tile_pixels(tile, lane_x, tiles_x, tiles_y, W, H, LANES, PX)
-    v0 = load_pixels(v_image, pixel4, column4, W, D, 0, PX)
-    v1 = load_pixels(v_image, pixel4, column4, W, D, 1, PX)
-    v2 = load_pixels(v_image, pixel4, column4, W, D, 2, PX)
-    v3 = load_pixels(v_image, pixel4, column4, W, D, 3, PX)
-    v_weight = load_pixels(v_alphas, pixel4, column4, W, 1, 0, PX)
-    rest = v_weight * load_pixels(alphas, pixel4, column4, W, 1, 0, PX)
-    rest += v0 * load_pixels(image, pixel4, column4, W, D, 0, PX) + v1 * load_pixels(image, pixel4, column4, W, D, 1, PX)
-    rest += v2 * load_pixels(image, pixel4, column4, W, D, 2, PX) + v3 * load_pixels(image, pixel4, column4, W, D, 3, PX)
+    view, tile, exists, x, y, cx, cy, column4, pixel4 = tile_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
+    v0 = load_pixels(v_image, pixel4, column4, W, D, 0)
+    v1 = load_pixels(v_image, pixel4, column4, W, D, 1)
+    v2 = load_pixels(v_image, pixel4, column4, W, D, 2)
+    v3 = load_pixels(v_image, pixel4, column4, W, D, 3)
+    v_weight = load_pixels(v_alphas, pixel4, column4, W, 1, 0)
+    rest = v_weight * load_pixels(alphas, pixel4, column4, W, 1, 0)
+    rest += v0 * load_pixels(image, pixel4, column4, W, D, 0) + v1 * load_pixels(image, pixel4, column4, W, D, 1)
+    rest += v2 * load_pixels(image, pixel4, column4, W, D, 2) + v3 * load_pixels(image, pixel4, column4, W, D, 3)
     if BACKGROUND:
         b = backgrounds + view * D
         behind = v0 * tl.load(b) + v1 * tl.load(b + 1, mask=D > 1, other=0.0)
         behind += v2 * tl.load(b + 2, mask=D > 2, other=0.0) + v3 * tl.load(b + 3, mask=D > 3, other=0.0)
         rest -= behind
         v_weight -= behind
-    T = glue(tl.where(column4 < W, 1.0, 1e-10), tl.where(column4 + 1 < W, 1.0, 1e-10), PX) + x * 0.0     # beyond the border finished, not 0
+    T = glue(tl.where(column4 < W, 1.0, 1e-10), tl.where(column4 + 1 < W, 1.0, 1e-10)) + x * 0.0     # beyond the border finished, not 0
     none = tl.sum(x * 0.0, 1, keep_dims=True)
-    start = tl.load(offsets + tile)
-    hits = (tl.load(offsets + tile + 1) - start).to(tl.int32)
+    start, hits, longest = tile_list(offsets, tile, exists)
     i = 0
     alive = True
-    while (i < hits) & alive:
-        stop = tl.minimum(i + CHECK, hits)              # whether the tile is finished is only looked at now and then
+    while (i < longest) & alive:
+        stop = tl.minimum(i + CHECK, longest)           # whether the tiles are finished is only looked at now and then
         while i < stop:
-            splat = tl.load(ids + start + i).to(tl.int64)
+            real = i < hits
+            splat = tl.load(ids + start + i, mask=real, other=null).to(tl.int64)
             p = records + splat * 12
             mx, my, l00, l10, l11, c0, c1, alpha = splat_alpha(p, x, y, cx, cy, T, log2_alpha, ALPHA_MAX, PTX)
             w = alpha * T
@@ -288,21 +293,24 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
                 slope_x, slope_y = mean_slopes(mx, my, l00, l10, l11, x, y)
                 ax = tl.sum(tl.abs(v * slope_x), 1, keep_dims=True)
                 ay = tl.sum(tl.abs(v * slope_y), 1, keep_dims=True)
-            value, slot, mask = lane_sums(s0, sx, sy, sxx, sxy, syy, w0, w1, w2, w3, ax, ay, 12 if ABSGRAD or D > 3 else 9, LANES, PTX)
+            COUNT: tl.constexpr = 12 if ABSGRAD or D > 3 else 9
+            first, slot, second, second_slot, has_second = tile_sums(s0, sx, sy, sxx, sxy, syy, w0, w1, w2, w3, ax, ay, COUNT, PTX)
             if PER_HIT:
-                tl.store(sums + (start + i) * 16 + slot, value, mask=mask)
+                q = sums + (start + i) * 16
+                tl.store(q + slot, first, mask=real)
+                tl.store(q + second_slot, second, mask=real & has_second)
             else:
-                tl.atomic_add(sums + splat * 16 + slot, value, mask=mask, sem="relaxed")
+                q = sums + splat * 16
+                tl.atomic_add(q + slot, first, mask=real, sem="relaxed")
+                tl.atomic_add(q + second_slot, second, mask=real & has_second, sem="relaxed")
             i += 1
         alive = tl.max(tl.max(T, 1), 0) > T_MIN
 
 
 @functools.cache
-def _lane_x(tile: int, lanes: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`[lanes, 4]`: x about the tile's centre of each lane's pixels, or of every second of 8."""
-    px = tile * tile // lanes
-    lane = torch.arange(lanes, device=device)[:, None] // tile * px
-    return (lane + torch.arange(0, px, px // 4, device=device)).to(dtype) - (tile / 2 - 0.5)
+def _lane_x(lanes: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """`[lanes, 4]`: x about the tile's centre of every second pixel of each lane's row."""
+    return (torch.arange(0, TILE.value, 2, device=device).to(dtype) - (TILE.value / 2 - 0.5)).repeat(lanes, 1)
 
 
 class _Scene:
@@ -327,19 +335,20 @@ class _Scene:
         target = current_target()
         self.common = {"ALPHA_MAX": alpha_max, "log2_alpha": footprint.log2_alpha, "enable_fp_fusion": True}
         lanes, ptx = target.lanes, target.ptx and means2d.dtype == torch.float32
-        self.lane_x = _lane_x(tile, lanes, means2d.dtype, means2d.device)
-        self.warp = {**self.common, "D": self.D, "LANES": lanes, "PX": tile * tile // lanes, "PTX": ptx}
+        self.lane_x = _lane_x(lanes, means2d.dtype, means2d.device)
+        self.blocks = self.C * ceil_div(self.grid[0], 2) * ceil_div(self.grid[1], lanes // (2 * tile))
+        self.warp = {**self.common, "D": self.D, "LANES": lanes, "PTX": ptx}
         self.block = {**self.common, "PRECISION": "tf32x3" if ptx else "ieee"}
 
 
 def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor, offsets: Tensor,
           width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
-    """Launcher; see `tsplat_reference.blend`. Tiles are 16 pixels wide."""
+    """Launcher; see `tsplat_reference.blend`. Tiles are 8 pixels wide."""
     s = _Scene(means2d, conics, opacities, colors, backgrounds, ids, offsets, width, height, tile, alpha_max)
     image, alphas = colors.new_empty(s.C, height, width, s.D), colors.new_empty(s.C, height, width)
     has_background = backgrounds is not None
     if s.D <= CHANNELS:
-        blend_fwd_kernel[(s.tiles,)](s.records, ids, offsets, s.backgrounds, image, alphas, s.lane_x, width, height, *s.grid, s.R,
+        blend_fwd_kernel[(s.blocks,)](s.records, ids, offsets, s.backgrounds, image, alphas, s.lane_x, width, height, *s.grid, s.R,
                                      BACKGROUND=has_background, **launch("blend"), **s.warp)
     else:
         options = launch("features")
@@ -366,8 +375,8 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
     sums = means2d.new_zeros(len(ids) if deterministic else s.R + 1, SUMS)
     v_colors = torch.zeros_like(s.colors)
     if s.D <= CHANNELS:
-        blend_bwd_kernel[(s.tiles,)](s.records, ids, offsets, s.backgrounds, image, alphas, v_image, v_alphas, sums, s.lane_x, width,
-                                     height, *s.grid, BACKGROUND=backgrounds is not None, ABSGRAD=absgrad, PER_HIT=deterministic,
+        blend_bwd_kernel[(s.blocks,)](s.records, ids, offsets, s.backgrounds, image, alphas, v_image, v_alphas, sums, s.lane_x, width,
+                                     height, *s.grid, s.R, BACKGROUND=backgrounds is not None, ABSGRAD=absgrad, PER_HIT=deterministic,
                                      lane_moments=footprint.lane_moments, mean_slopes=footprint.mean_slopes,
                                      **launch("blend_backward"), **s.warp)
         if deterministic:

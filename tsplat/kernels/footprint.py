@@ -18,8 +18,8 @@ from tsplat_reference.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 
 LOG2_MIN = tl.constexpr(math.log2(ALPHA_MIN))
 T_MIN = tl.constexpr(TRANSMITTANCE_MIN)
-TILE = tl.constexpr(16)
-"""Side of a tile: 256 pixels are 8 for each lane of a warp."""
+TILE = tl.constexpr(8)
+"""Side of a tile: a lane takes a row."""
 RECORD = 12
 """Numbers in a record."""
 MOMENTS = 6
@@ -45,7 +45,7 @@ def mean_slopes(mx, my, l00, l10, l11, x, y):
 
 @triton.jit
 def lane_moments(v, mx, my, x, y):
-    """Per lane: the six sums over the pixels v `[32, PX]` of a row segment at x `[32, PX]`, y `[32, 1]`."""
+    """Per lane: the six sums over the pixels v `[LANES, 8]` of a row at x `[LANES, 8]`, y `[LANES, 1]`."""
     vx = v * x
     s0 = tl.sum(v, 1, keep_dims=True)
     local = tl.sum(vx, 1, keep_dims=True)

@@ -23,6 +23,7 @@ CANDIDATES: dict[str, tuple[str, int, list[dict[str, int]]]] = {
     "project": ("project", 3, SPLATS),
     "project_backward": ("project_backward", 3, SPLATS),
     "bin": ("bin", 3, SPLATS),
+    "pick": ("bin", 3, [{"BLOCK": 32 * k * w, "num_warps": w} for k in (2, 4, 8, 16) for w in (1, 2, 4)]),
     "records": ("blend", 3, SPLATS),
     "blend": ("blend", 3, [{"UNROLL": u, "num_warps": 1} for u in (1, 2, 4, 8, 16)]),
     "blend_backward": ("blend_backward", 3, [{"CHECK": c, "num_warps": 1} for c in (1, 2, 4, 8, 16, 32)]),

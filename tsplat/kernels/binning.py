@@ -1,4 +1,10 @@
-"""Tile intersection in depth order: a thread per splat counts and then writes its hits; torch's radix sorts do the rest."""
+"""Tile intersection in depth order, on two levels: a radix sort of the few hits of splats and bins of 8 x 8 tiles, then each tile picks its
+own from the list of its bin, by counting.
+
+A thread per splat counts and writes its hits of bins. Each of these gets 8 bytes, a bit per tile of the bin, and a program per tile counts and
+then copies the splats that have its bit. Against sorting the hits of tiles, of which there are 4 times as many, that saves most of the
+memory (torch's sort takes 8 bytes of index per key, twice) and of its traffic.
+"""
 
 from __future__ import annotations
 
@@ -10,8 +16,11 @@ import triton.language as tl
 from torch import Tensor
 from tsplat_reference.constants import ALPHA_MIN, BIN_SLACK, BIN_SLACK_RELATIVE, EXTENT_MAX
 
+from tsplat.kernels.footprint import TILE
 from tsplat.kernels.launch import ceil_div, launch
 
+SIDE = tl.constexpr(8)
+"""Tiles along the side of a bin: a row of them is a byte."""
 LOG_MIN = tl.constexpr(math.log(ALPHA_MIN))
 LEVEL_MAX = tl.constexpr(EXTENT_MAX**2)
 SLACK = tl.constexpr(BIN_SLACK)
@@ -27,8 +36,14 @@ def span(low, high, size, TILE: tl.constexpr):
 
 
 @triton.jit
-def ellipse(means2d, conics, opacities, splat, real, H, EPS: tl.constexpr, TILE: tl.constexpr):
-    """The ellipse a dx^2 + 2 b dx dy + c dy^2 = level in which alpha reaches 1/255, with a slack for rounding, and its rows of tiles."""
+def visible(radii, splat, real):
+    """Whether splats were not culled."""
+    return real & (tl.load(radii + 2 * splat, mask=real, other=0) > 0) & (tl.load(radii + 2 * splat + 1, mask=real, other=0) > 0)
+
+
+@triton.jit
+def ellipse(means2d, conics, opacities, splat, real, H, EPS: tl.constexpr):
+    """The ellipse a dx^2 + 2 b dx dy + c dy^2 = level in which alpha reaches 1/255, with a slack for rounding."""
     mx = tl.load(means2d + 2 * splat, mask=real, other=0.0)
     my = tl.load(means2d + 2 * splat + 1, mask=real, other=0.0)
     a = tl.load(conics + 3 * splat, mask=real, other=1.0)
@@ -40,8 +55,14 @@ def ellipse(means2d, conics, opacities, splat, real, H, EPS: tl.constexpr, TILE:
     level = tl.minimum(tl.maximum(level, 0.0), tl.full((), LEVEL_MAX, dt)) * (1.0 + SLACK_RELATIVE) + SLACK
     det = tl.maximum(a * c - b * b, EPS * a * c)
     half = tl.sqrt(level * a / det)
+    return mx, my, a, b, c, level, det, half
+
+
+@triton.jit
+def rows(my, half, real, H, TILE: tl.constexpr):
+    """First and last row of tiles of an ellipse; last < first if there is none."""
     first, last = span(my - half, my + half, H, TILE)
-    return mx, my, a, b, c, level, det, half, first, tl.where(real, last, first - 1)
+    return first, tl.where(real, last, first - 1)
 
 
 @triton.jit
@@ -57,37 +78,44 @@ def row_span(row, mx, my, a, b, c, level, det, half, W, H, TILE: tl.constexpr):
     return span(mx + x_low, mx + x_high, W, TILE)
 
 
-@triton.jit(do_not_specialize=["R", "W", "H"])
-def count_kernel(order, visible, means2d, conics, opacities, counts, R, W, H, EPS: tl.constexpr, TILE: tl.constexpr,
-                 BLOCK: tl.constexpr):
-    """Number of tiles that each splat hits, in depth order."""
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    splat = tl.load(order + i, mask=i < R, other=0).to(tl.int64)
-    real = (i < R) & (tl.load(visible + splat, mask=i < R, other=0) != 0)
-    mx, my, a, b, c, level, det, half, first, last = ellipse(means2d, conics, opacities, splat, real, H, EPS, TILE)
-    count = tl.zeros([BLOCK], tl.int32)
-    row = first
+@triton.jit
+def count_hits(mx, my, a, b, c, level, det, half, real, W, H, TILE: tl.constexpr):
+    """Number of tiles that each splat hits."""
+    row, last = rows(my, half, real, H, TILE)
+    count = row * 0
     while tl.max((row <= last).to(tl.int32), 0) > 0:
         left, right = row_span(row, mx, my, a, b, c, level, det, half, W, H, TILE)
         count += tl.where(row <= last, tl.maximum(right - left + 1, 0), 0)
         row += 1
-    tl.store(counts + i, count, mask=i < R)
+    return count
 
 
-@triton.jit(do_not_specialize=["R", "N", "W", "H", "tiles_x", "tiles_y", "capacity"])
-def emit_kernel(order, visible, means2d, conics, opacities, ends, counts, keys, ids, R, N, W, H, tiles_x, tiles_y, capacity,
-                EPS: tl.constexpr, TILE: tl.constexpr, BLOCK: tl.constexpr):
-    """Tile and splat of each hit, splat after splat; hits beyond the capacity are not written."""
+@triton.jit(do_not_specialize=["R", "W", "H"])
+def count_kernel(order, radii, means2d, conics, opacities, counts, R, W, H, EPS: tl.constexpr, TILE: tl.constexpr, SIDE: tl.constexpr,
+                 BLOCK: tl.constexpr):
+    """Numbers of bins and of tiles that each splat hits, in depth order: counts `[2, R]`."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    splat = tl.load(order + i, mask=i < R, other=0).to(tl.int64)
-    real = (i < R) & (tl.load(visible + splat, mask=i < R, other=0) != 0)
-    mx, my, a, b, c, level, det, half, first, last = ellipse(means2d, conics, opacities, splat, real, H, EPS, TILE)
+    splat = tl.load(order + i, mask=i < R, other=0)
+    real = visible(radii, splat, i < R)
+    mx, my, a, b, c, level, det, half = ellipse(means2d, conics, opacities, splat, real, H, EPS)
+    tl.store(counts + i, count_hits(mx, my, a, b, c, level, det, half, real, W, H, TILE * SIDE), mask=i < R)
+    tl.store(counts + R + i, count_hits(mx, my, a, b, c, level, det, half, real, W, H, TILE), mask=i < R)
+
+
+@triton.jit(do_not_specialize=["R", "N", "W", "H", "bins_x", "bins_y", "capacity"])
+def emit_kernel(order, radii, means2d, conics, opacities, counts, ends, keys, ids, R, N, W, H, bins_x, bins_y, capacity,
+                EPS: tl.constexpr, TILE: tl.constexpr, SIDE: tl.constexpr, BLOCK: tl.constexpr):
+    """Bin and splat of each hit of bins, splat after splat; hits beyond the capacity are not written."""
+    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    splat = tl.load(order + i, mask=i < R, other=0)
+    real = visible(radii, splat, i < R)
+    mx, my, a, b, c, level, det, half = ellipse(means2d, conics, opacities, splat, real, H, EPS)
+    row, last = rows(my, half, real, H, TILE * SIDE)
     at = tl.load(ends + i, mask=i < R, other=0) - tl.load(counts + i, mask=i < R, other=0)
-    row = first
     while tl.max((row <= last).to(tl.int32), 0) > 0:
-        left, right = row_span(row, mx, my, a, b, c, level, det, half, W, H, TILE)
+        left, right = row_span(row, mx, my, a, b, c, level, det, half, W, H, TILE * SIDE)
         right = tl.where(row <= last, right, left - 1)
-        base = (splat // N * tiles_y + row) * tiles_x
+        base = (splat // N * bins_y + row) * bins_x
         column = left
         while tl.max((column <= right).to(tl.int32), 0) > 0:
             mask = (column <= right) & (at < capacity)
@@ -98,11 +126,69 @@ def emit_kernel(order, visible, means2d, conics, opacities, ends, counts, keys, 
         row += 1
 
 
+@triton.jit(do_not_specialize=["M", "bins", "bins_x", "bins_y", "W", "H"])
+def mask_kernel(keys, by_bin, ids, means2d, conics, opacities, sorted_ids, masks, M, bins, bins_x, bins_y, W, H, EPS: tl.constexpr,
+                TILE: tl.constexpr, SIDE: tl.constexpr, BLOCK: tl.constexpr):
+    """Which tiles of the bin a splat hits: masks `[SIDE, M]`, a bit per tile of a row. Room beyond the hits has bin `bins`."""
+    j = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
+    bin = tl.load(keys + j, mask=j < M, other=bins).to(tl.int64)
+    real = bin < bins
+    splat = tl.load(ids + tl.load(by_bin + j, mask=real, other=0), mask=real, other=0)
+    tl.store(sorted_ids + j, splat, mask=real)
+    mx, my, a, b, c, level, det, half = ellipse(means2d, conics, opacities, splat.to(tl.int64), real, H, EPS)
+    first, last = rows(my, half, real, H, TILE)
+    low = (bin % bins_x).to(tl.int32) * SIDE
+    row = (bin // bins_x % bins_y).to(tl.int32) * SIDE
+    for r in tl.static_range(SIDE):
+        left, right = row_span(row, mx, my, a, b, c, level, det, half, W, H, TILE)
+        left = tl.maximum(left - low, 0)
+        right = tl.minimum(right - low, SIDE - 1)
+        hit = (row >= first) & (row <= last) & (left <= right)
+        bits = tl.where(hit, ((2 << tl.maximum(right, 0)) - 1) & ~((1 << tl.minimum(left, SIDE)) - 1), 0)
+        tl.store(masks + r * M.to(tl.int64) + j, bits.to(tl.uint8), mask=real)
+        row += 1
+
+
+@triton.jit(do_not_specialize=["M", "bins_x", "bins_y", "tiles_x", "tiles_y", "capacity"])
+def pick_kernel(edges, sorted_ids, masks, offsets, counts, ids, M, bins_x, bins_y, tiles_x, tiles_y, capacity, WRITE: tl.constexpr,
+                SIDE: tl.constexpr, BLOCK: tl.constexpr):
+    """A program per bin and tile of it. Number of its splats, after a first 0: counts `[tiles + 1]`; or (WRITE) the splats themselves, in
+    the order of the bin's list."""
+    bin = tl.program_id(0).to(tl.int64)
+    r = tl.program_id(1) // SIDE
+    c = tl.program_id(1) % SIDE
+    row = (bin // bins_x % bins_y).to(tl.int32) * SIDE + r
+    column = (bin % bins_x).to(tl.int32) * SIDE + c
+    inside = (row < tiles_y) & (column < tiles_x)
+    tile = (bin // (bins_x.to(tl.int64) * bins_y) * tiles_y + row) * tiles_x + column
+    i = tl.load(edges + bin)
+    end = tl.where(inside, tl.load(edges + bin + 1), i)
+    lane = tl.arange(0, BLOCK)
+    if WRITE:
+        at = tl.load(offsets + tile, mask=inside, other=0)
+    else:
+        total = lane * 0
+    while i < end:
+        j = i + lane
+        bit = (tl.load(masks + r * M.to(tl.int64) + j, mask=j < end, other=0).to(tl.int32) >> c) & 1
+        if WRITE:
+            to = at + tl.cumsum(bit, 0) - 1
+            mask = (bit != 0) & (to < capacity)
+            tl.store(ids + to, tl.load(sorted_ids + j, mask=mask, other=0), mask=mask)
+            at += tl.sum(bit, 0)
+        else:
+            total += bit
+        i += BLOCK
+    if not WRITE:
+        tl.store(counts + tile + 1, tl.sum(total, 0), mask=inside)
+        tl.store(counts, 0, mask=tile == 0)
+
+
 def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
                ) -> tuple[Tensor, Tensor]:
     """Launcher; see `tsplat_reference.bin_splats`. One host sync, for the number of hits."""
     splats = _Splats(means2d, radii, conics, opacities, depths, width, height, tile)
-    return splats.bins(int(splats.ends[-1]) if len(splats.ends) else 0)
+    return splats.lists(*splats.ends[:, -1].tolist()) if splats.R else splats.lists(0, 0)
 
 
 def bin_splats_fixed(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int,
@@ -110,41 +196,55 @@ def bin_splats_fixed(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: 
     """As `bin_splats` without a host sync, for CUDA graphs: room for `capacity` hits.
 
     Returns:
-        ids `[capacity]`, of which the first offsets[-1] count; offsets; and the number of hits there are, int64 `[]` on the device. If
-        that is more than `capacity`, hits of the farthest splats are missing: bin again with more.
+        ids `[capacity]`, of which the first offsets[-1] count; offsets; and the capacity that was needed, int64 `[]` on the device. If
+        that is more than `capacity`, hits are missing, and tiles at the end may have none: bin again with more.
     """
     splats = _Splats(means2d, radii, conics, opacities, depths, width, height, tile)
-    hits = splats.ends[-1] if len(splats.ends) else splats.ends.sum()
-    return *splats.bins(capacity), hits
+    ids, offsets = splats.lists(capacity, capacity)
+    return ids, offsets.clamp_(max=capacity), splats.ends[:, -1].amax() if splats.R else splats.ends.sum()
 
 
 class _Splats:
-    """Splats in depth order, with their hits counted."""
+    """Splats in depth order, with their hits of bins and of tiles counted."""
 
     def __init__(self, means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
                  ) -> None:
-        (C, self.N), self.R = opacities.shape, opacities.numel()
-        self.size, self.grid = (width, height), (ceil_div(width, tile), ceil_div(height, tile))
-        self.tiles = C * self.grid[0] * self.grid[1]
-        order = depths.flatten().sort(stable=True).indices.to(torch.int32)                  # a radix sort of 4 passes
-        visible = (radii > 0).all(-1).flatten().to(torch.uint8)
-        self.splats = order, visible, means2d.contiguous(), conics.contiguous(), opacities.contiguous()
-        self.options = {"EPS": torch.finfo(means2d.dtype).eps, "TILE": tile, **launch("bin"), "enable_fp_fusion": True}
+        if tile != TILE.value:
+            raise ValueError(f"tile: expected {TILE.value}, the tile of the Triton kernels; got {tile}")
+        (self.C, self.N), self.R = opacities.shape, opacities.numel()
+        self.size, self.tiles = (width, height), (ceil_div(width, tile), ceil_div(height, tile))
+        self.bins = ceil_div(self.tiles[0], SIDE.value), ceil_div(self.tiles[1], SIDE.value)
+        self.depth_order = depths.flatten().sort(stable=True).indices                       # a radix sort of 4 passes
+        self.radii, self.shapes = radii.contiguous(), (means2d.contiguous(), conics.contiguous(), opacities.contiguous())
+        self.options = {"EPS": torch.finfo(means2d.dtype).eps, "TILE": tile, "SIDE": SIDE.value, **launch("bin"), "enable_fp_fusion": True}
         self.programs = ceil_div(self.R, self.options["BLOCK"])
-        self.counts = torch.empty(self.R, dtype=torch.int32, device=means2d.device)
+        self.counts = torch.empty(2, self.R, dtype=torch.int32, device=means2d.device)
         if self.R:
-            count_kernel[(self.programs,)](*self.splats, self.counts, self.R, *self.size, **self.options)
-        self.ends = self.counts.cumsum(0)                                                   # int64: more than 2^31 hits are counted right
+            count_kernel[(self.programs,)](self.depth_order, self.radii, *self.shapes, self.counts, self.R, *self.size, **self.options)
+        self.ends = self.counts.cumsum(1)                                                   # int64: more than 2^31 hits are counted right
 
-    def bins(self, capacity: int) -> tuple[Tensor, Tensor]:
-        """Ids and offsets; hits beyond the capacity are left out, and room beyond the hits goes to a tile after the last."""
-        device = self.counts.device
-        narrow = next(d for d in (torch.int16, torch.int32, torch.int64) if self.tiles <= torch.iinfo(d).max)
-        keys = torch.full((capacity,), self.tiles, dtype=narrow, device=device)
-        ids = torch.zeros(capacity, dtype=torch.int32, device=device)
-        if self.R and capacity:
-            emit_kernel[(self.programs,)](*self.splats, self.ends, self.counts, keys, ids, self.R, self.N, *self.size, *self.grid,
-                                                    capacity, **self.options)
-        keys, by_tile = keys.sort(stable=True)                                              # int16 keys: 2 passes
-        offsets = torch.searchsorted(keys, torch.arange(self.tiles + 1, device=device, dtype=narrow))
-        return ids[by_tile], offsets
+    def lists(self, coarse: int, fine: int) -> tuple[Tensor, Tensor]:
+        """Ids and offsets, with room for so many hits of bins and of tiles; hits beyond are left out."""
+        device, bins = self.counts.device, self.C * self.bins[0] * self.bins[1]
+        counts = torch.empty(self.C * self.tiles[0] * self.tiles[1] + 1, dtype=torch.int32, device=device)
+        # zeros, as deterministic blending reads ids beyond the last offset, which there are in a fixed capacity
+        ids = torch.zeros(fine, dtype=torch.int32, device=device)
+        if not (self.R and coarse):
+            return ids, counts.zero_().to(torch.int64)
+        narrow = next(d for d in (torch.int16, torch.int32, torch.int64) if bins <= torch.iinfo(d).max)
+        keys = torch.full((coarse,), bins, dtype=narrow, device=device)                     # what is not overwritten is room beyond the hits
+        unsorted = torch.empty(coarse, dtype=torch.int32, device=device)
+        emit_kernel[(self.programs,)](self.depth_order, self.radii, *self.shapes, self.counts, self.ends, keys, unsorted, self.R, self.N,
+                                      *self.size, *self.bins, coarse, **self.options)
+        keys, by_bin = keys.sort(stable=True)                                               # int16 keys: 2 passes
+        edges = torch.searchsorted(keys, torch.arange(bins + 1, device=device, dtype=narrow))
+        sorted_ids, masks = torch.empty_like(unsorted), torch.empty(SIDE.value, coarse, dtype=torch.uint8, device=device)
+        mask_kernel[(ceil_div(coarse, self.options["BLOCK"]),)](keys, by_bin, unsorted, *self.shapes, sorted_ids, masks, coarse, bins,
+                                                                *self.bins, *self.size, **self.options)
+        del unsorted, by_bin, keys
+        grid, options = (bins, SIDE.value**2), {"SIDE": SIDE.value, **launch("pick")}
+        lists = edges, sorted_ids, masks
+        pick_kernel[grid](*lists, counts, counts, ids, coarse, *self.bins, *self.tiles, fine, WRITE=False, **options)
+        offsets = counts.cumsum(0)
+        pick_kernel[grid](*lists, offsets, counts, ids, coarse, *self.bins, *self.tiles, fine, WRITE=True, **options)
+        return ids, offsets

@@ -53,6 +53,7 @@ LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "harmonics": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
     "harmonics_backward": {"nvidia": _splats(32, 1), "cdna": _splats(64, 1), "rdna": _splats(32, 1)},
     "bin": {"nvidia": _splats(64, 2), "cdna": _splats(64, 1), "rdna": _splats(64, 2)},
+    "pick": {family: _splats(256, 1) for family in FAMILIES},
     "records": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
     "blend": {family: {"UNROLL": 8, "num_warps": 1} for family in FAMILIES},
     "blend_backward": {family: {"CHECK": 8, "num_warps": 1} for family in FAMILIES},

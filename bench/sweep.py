@@ -18,7 +18,7 @@ from gpu import SIZES, milliseconds, stage_calls, to
 from scenes import random_scene
 
 SPLATS = [{"BLOCK": block, "num_warps": warps} for block, warps in itertools.product((32, 64, 128, 256), (1, 2, 4)) if block >= 32 * warps]
-PRODUCTS = [{"P": p, "K": k, "DB": d, "num_warps": w} for p, k, d, w in itertools.product((64, 128, 256), (16, 32), (16, 32, 64), (4, 8))]
+PRODUCTS = [{"P": 64, "K": k, "DB": d, "num_warps": w} for k, d, w in itertools.product((16, 32, 64), (16, 32, 64, 128), (4, 8))]
 CANDIDATES: dict[str, tuple[str, int, list[dict[str, int]]]] = {
     "project": ("project", 3, SPLATS),
     "project_backward": ("project_backward", 3, SPLATS),
@@ -26,9 +26,9 @@ CANDIDATES: dict[str, tuple[str, int, list[dict[str, int]]]] = {
     "pick": ("bin", 3, [{"BLOCK": 32 * k * w, "num_warps": w} for k in (2, 4, 8, 16) for w in (1, 2, 4)]),
     "records": ("blend", 3, SPLATS),
     "blend": ("blend", 3, [{"UNROLL": u, "num_warps": 1} for u in (1, 2, 4, 8, 16)]),
-    "blend_backward": ("blend_backward", 3, [{"CHECK": c, "num_warps": 1} for c in (1, 2, 4, 8, 16, 32)]),
-    "features": ("blend", 128, PRODUCTS),
-    "features_backward": ("blend_backward", 128, [c for c in PRODUCTS if c["DB"] <= 32]),
+    "blend_backward": ("blend_backward", 3, [{"CHECK": c, "NONZERO": z, "num_warps": 1} for c in (2, 8, 32) for z in (0, 1)]),
+    "features": ("blend", 128, [c for c in PRODUCTS if c["DB"] >= 32]),
+    "features_backward": ("blend_backward", 128, [c for c in PRODUCTS if c["DB"] <= 64 and c["K"] <= 32]),
 }
 """Per kernel: the stage that it is timed in, the channels of the scene, and what to try."""
 

@@ -104,20 +104,25 @@ def both_or_zero(value, a, a_min: tl.constexpr, b, b_min: tl.constexpr):
 
 
 @triton.jit
-def splat_alpha(p, x, y, cx, cy, T, log2_alpha: tl.constexpr,
-                ALPHA_MAX: tl.constexpr, PTX: tl.constexpr):
-    """Record and alpha at the pixels: 0 below 1/255, and where the pixel is finished."""
-    mx, my, l00, l10 = load4(p)
-    l11, log2_opacity, c0, c1 = load4(p + 4)
-    mx -= cx
-    my -= cy
+def load_record(records, splat, D: tl.constexpr):
+    """Each lane's splat: mean, shape (3), log2 opacity, and D colours or more."""
+    p = records + splat.to(tl.int64) * 12
+    if D <= 2:
+        return load4(p) + load4(p + 4)
+    else:
+        return load4(p) + load4(p + 4) + load4(p + 8)
+
+
+@triton.jit
+def splat_alpha(mx, my, l00, l10, l11, log2_opacity, x, y, T, log2_alpha: tl.constexpr, ALPHA_MAX: tl.constexpr, PTX: tl.constexpr):
+    """Alpha at the pixels: 0 below 1/255, and where the pixel is finished."""
     power = log2_alpha(mx, my, l00, l10, l11, log2_opacity, x, y)
     alpha = tl.minimum(tl.exp2(power), tl.full((), ALPHA_MAX, x.dtype))    # a literal would be rounded to float32
     if PTX:
         alpha = both_or_zero(alpha, power, LOG2_MIN, T, T_MIN)
     else:
         alpha = tl.where((power >= LOG2_MIN) & (T > T_MIN), alpha, 0.0)
-    return mx, my, l00, l10, l11, c0, c1, alpha
+    return alpha
 
 
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null"])
@@ -137,17 +142,15 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
     while (i < longest) & alive:
         for u in tl.static_range(UNROLL):
             splat = tl.load(ids + start + i + u, mask=i + u < hits, other=null)
-            p = records + splat.to(tl.int64) * 12
-            _, _, _, _, _, c0, c1, alpha = splat_alpha(p, x, y, cx, cy, T, log2_alpha, ALPHA_MAX, PTX)
-            w = alpha * T
-            C0 += c0 * w
+            r = load_record(records, splat, D)
+            w = T * splat_alpha(r[0] - cx, r[1] - cy, r[2], r[3], r[4], r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
+            C0 += r[6] * w
             if D > 1:
-                C1 += c1 * w
+                C1 += r[7] * w
             if D > 2:
-                c2, c3, _, _ = load4(p + 8)
-                C2 += c2 * w
-                if D > 3:
-                    C3 += c3 * w
+                C2 += r[8] * w
+            if D > 3:
+                C3 += r[9] * w
             T -= w
         i += UNROLL
         alive = tl.max(tl.max(T, 1), 0) > T_MIN
@@ -231,7 +234,7 @@ def tile_sums(s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, COUNT: tl.conste
 def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image, v_alphas, sums, lane_x, W, H, tiles_x, tiles_y, null,
                      D: tl.constexpr, ALPHA_MAX: tl.constexpr, BACKGROUND: tl.constexpr, ABSGRAD: tl.constexpr, PER_HIT: tl.constexpr,
                      log2_alpha: tl.constexpr, lane_moments: tl.constexpr, mean_slopes: tl.constexpr, LANES: tl.constexpr,
-                     CHECK: tl.constexpr, PTX: tl.constexpr):
+                     CHECK: tl.constexpr, NONZERO: tl.constexpr, PTX: tl.constexpr):
     """Sums `[R, 16]` over the pixels, per splat (atomic), or per hit `[M, 16]` (PER_HIT, for the same bits in every run).
 
     Front to back: `rest` is what is still to come, times the upstream gradient; it starts as <image, dL/dimage> + alpha dL/dalpha without
@@ -262,18 +265,20 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
         stop = tl.minimum(i + CHECK, longest)           # whether the tiles are finished is only looked at now and then
         while i < stop:
             real = i < hits
-            splat = tl.load(ids + start + i, mask=real, other=null).to(tl.int64)
-            p = records + splat * 12
-            mx, my, l00, l10, l11, c0, c1, alpha = splat_alpha(p, x, y, cx, cy, T, log2_alpha, ALPHA_MAX, PTX)
+            splat = tl.load(ids + start + i, mask=real, other=null)
+            r = load_record(records, splat, D)
+            mx = r[0] - cx
+            my = r[1] - cy
+            l00, l10, l11 = r[2:5]
+            alpha = splat_alpha(mx, my, l00, l10, l11, r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
             w = alpha * T
-            g = v_weight + c0 * v0
+            g = v_weight + r[6] * v0
             if D > 1:
-                g += c1 * v1
+                g += r[7] * v1
             if D > 2:
-                c2, c3, _, _ = load4(p + 8)
-                g += c2 * v2
-                if D > 3:
-                    g += c3 * v3
+                g += r[8] * v2
+            if D > 3:
+                g += r[9] * v3
             rest -= w * g
             T -= w
             if PTX:
@@ -300,8 +305,8 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
                 tl.store(q + slot, first, mask=real)
                 tl.store(q + second_slot, second, mask=real & has_second)
             else:
-                q = sums + splat * 16
-                tl.atomic_add(q + slot, first, mask=real, sem="relaxed")
+                q = sums + splat.to(tl.int64) * 16
+                tl.atomic_add(q + slot, first, mask=real & (first != 0) if NONZERO else real, sem="relaxed")
                 tl.atomic_add(q + second_slot, second, mask=real & has_second, sem="relaxed")
             i += 1
         alive = tl.max(tl.max(T, 1), 0) > T_MIN

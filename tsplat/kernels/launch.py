@@ -56,7 +56,7 @@ LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "pick": {family: _splats(256, 1) for family in FAMILIES},
     "records": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
     "blend": {family: {"UNROLL": 8, "num_warps": 1} for family in FAMILIES},
-    "blend_backward": {family: {"CHECK": 8, "num_warps": 1} for family in FAMILIES},
+    "blend_backward": {family: {"CHECK": 8, "NONZERO": 0, "num_warps": 1} for family in FAMILIES},
     "features": {family: {"P": 64, "K": 16, "DB": 32, "num_warps": 8} for family in FAMILIES},
     "features_backward": {family: {"P": 64, "K": 16, "DB": 16, "num_warps": 8} for family in FAMILIES},
 }

@@ -13,7 +13,7 @@ from tsplat import ops
 from tsplat.camera import Camera
 from tsplat.checks import check_choice, check_number, check_size, check_tensor
 
-CPU_TILE, GPU_TILE = 8, 16
+TILE = 8
 """Pixels along the side of a tile. On a CPU 8 beats 4, 6 and 16: smaller tiles have more hits to sort, larger ones more idle pairs."""
 MAX_DEGREE = 4
 
@@ -84,14 +84,14 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
         screen_offset: `[C, N, 2]` in pixels, added to the projected means. Pass zeros that require grad to get the screen-space
             gradient that density control needs, under torch.compile as well.
         absgrad: `[C, N, 2]` that requires grad; changes nothing, and receives the sum over pixels of |dL/dmean2d| (AbsGS).
-        tile: pixels along the side of a tile; never visible in the result. Default 8 on a CPU, 16 (and no other) on a GPU.
+        tile: pixels along the side of a tile; never visible in the result. 8, the default, is the only one on a GPU.
 
     Raises:
         ValueError, TypeError: naming the argument, what came and what is expected.
         NotImplementedError: on a GPU where Triton is not installed, and for forward-mode derivatives.
     """
     if tile is None:
-        tile = CPU_TILE if getattr(means, "is_cpu", True) else GPU_TILE
+        tile = TILE
     _check(means, quats, scales, opacities, colors, camera, sh_degree, covars, background, depth, eps2d, alpha_max, screen_offset, absgrad,
            tile)
     C, width, height = len(camera), camera.width, camera.height

@@ -104,6 +104,33 @@ def both_or_zero(value, a, a_min: tl.constexpr, b, b_min: tl.constexpr):
 
 
 @triton.jit
+def load_batch(ids, start, i, hits, null):
+    """Splats i to i + 7 of each tile, one in each of its lanes; the null splat beyond its list."""
+    j = i + tl.arange(0, start.shape[0])[:, None] % TILE
+    return tl.load(ids + start + j, mask=j < hits, other=null)
+
+
+@triton.jit
+def of_batch(batch, u, ids, start, i, hits, null, PTX: tl.constexpr):
+    """Splat u of each tile's batch, in all of its lanes: a shuffle, where a load would take a mask and an address."""
+    if PTX:
+        return tl.inline_asm_elementwise("shfl.sync.idx.b32 $0, $1, $2, 0x181f, 0xffffffff;", "=r,r,r", [batch, tl.zeros_like(batch) + u],
+                                         dtype=tl.int32, is_pure=False, pack=1)
+    else:
+        return tl.load(ids + start + i + u, mask=i + u < hits, other=null)
+
+
+@triton.jit
+def prefetch_records(records, batch, PTX: tl.constexpr):
+    """Have the records of the next batch fetched into L1 while this one is blended, each lane one: 2 sectors of 32 bytes. Half of the cycles
+    of a warp were waiting for them."""
+    if PTX:
+        p = (records + batch.to(tl.int64) * 12).to(tl.int64)
+        for word in tl.static_range(2):
+            tl.inline_asm_elementwise("prefetch.global.L1 [$1]; mov.b32 $0, 0;", "=r,l", [p + 44 * word], dtype=tl.int32, is_pure=False, pack=1)
+
+
+@triton.jit
 def load_record(records, splat, D: tl.constexpr):
     """Each lane's splat: mean, shape (3), log2 opacity, and D colours or more."""
     p = records + splat.to(tl.int64) * 12
@@ -128,7 +155,7 @@ def splat_alpha(mx, my, l00, l10, l11, log2_opacity, x, y, T, log2_alpha: tl.con
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null"])
 def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, W, H, tiles_x, tiles_y, null, D: tl.constexpr,
                      BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, LANES: tl.constexpr,
-                     UNROLL: tl.constexpr, PTX: tl.constexpr):
+                     PTX: tl.constexpr):
     """Image `[C, H, W, D]` and alpha `[C, H, W]` of a block of tiles."""
     view, tile, exists, x, y, cx, cy, column4, pixel4 = tile_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
     T = glue(tl.where(column4 < W, 1.0, 0.0), tl.where(column4 + 1 < W, 1.0, 0.0)) + x * 0.0     # beyond the border finished
@@ -138,10 +165,13 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
     C3 = x * 0.0
     start, hits, longest = tile_list(offsets, tile, exists)
     i = 0
-    alive = True
-    while (i < longest) & alive:
-        for u in tl.static_range(UNROLL):
-            splat = tl.load(ids + start + i + u, mask=i + u < hits, other=null)
+    batch = load_batch(ids, start, 0, hits, null)
+    following = load_batch(ids, start, TILE, hits, null)
+    while i < longest:
+        later = load_batch(ids, start, i + 2 * TILE, hits, null)        # two batches ahead, so that nothing waits for it
+        prefetch_records(records, following, PTX)
+        for u in tl.static_range(TILE):
+            splat = of_batch(batch, u, ids, start, i, hits, null, PTX)
             r = load_record(records, splat, D)
             w = T * splat_alpha(r[0] - cx, r[1] - cy, r[2], r[3], r[4], r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
             C0 += r[6] * w
@@ -152,8 +182,10 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
             if D > 3:
                 C3 += r[9] * w
             T -= w
-        i += UNROLL
-        alive = tl.max(tl.max(T, 1), 0) > T_MIN
+        i += TILE
+        batch = following
+        following = later
+        longest = tl.where(tl.max(tl.max(T, 1), 0) > T_MIN, longest, 0)     # finished tiles are only looked for once per batch
     if BACKGROUND:
         b = backgrounds + view * D
         C0 += T * tl.load(b)
@@ -234,7 +266,7 @@ def tile_sums(s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, COUNT: tl.conste
 def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image, v_alphas, sums, lane_x, W, H, tiles_x, tiles_y, null,
                      D: tl.constexpr, ALPHA_MAX: tl.constexpr, BACKGROUND: tl.constexpr, ABSGRAD: tl.constexpr, PER_HIT: tl.constexpr,
                      log2_alpha: tl.constexpr, lane_moments: tl.constexpr, mean_slopes: tl.constexpr, LANES: tl.constexpr,
-                     CHECK: tl.constexpr, NONZERO: tl.constexpr, PTX: tl.constexpr):
+                     PTX: tl.constexpr):
     """Sums `[R, 16]` over the pixels, per splat (atomic), or per hit `[M, 16]` (PER_HIT, for the same bits in every run).
 
     Front to back: `rest` is what is still to come, times the upstream gradient; it starts as <image, dL/dimage> + alpha dL/dalpha without
@@ -260,12 +292,16 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
     none = tl.sum(x * 0.0, 1, keep_dims=True)
     start, hits, longest = tile_list(offsets, tile, exists)
     i = 0
-    alive = True
-    while (i < longest) & alive:
-        stop = tl.minimum(i + CHECK, longest)           # whether the tiles are finished is only looked at now and then
-        while i < stop:
-            real = i < hits
-            splat = tl.load(ids + start + i, mask=real, other=null)
+    batch = load_batch(ids, start, 0, hits, null)
+    following = load_batch(ids, start, TILE, hits, null)
+    while i < longest:
+        later = load_batch(ids, start, i + 2 * TILE, hits, null)
+        prefetch_records(records, following, PTX)
+        stop = tl.minimum(TILE, longest - i)
+        u = 0
+        while u < stop:
+            splat = of_batch(batch, u, ids, start, i, hits, null, PTX)
+            real = i + u < hits
             r = load_record(records, splat, D)
             mx = r[0] - cx
             my = r[1] - cy
@@ -301,15 +337,18 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
             COUNT: tl.constexpr = 12 if ABSGRAD or D > 3 else 9
             first, slot, second, second_slot, has_second = tile_sums(s0, sx, sy, sxx, sxy, syy, w0, w1, w2, w3, ax, ay, COUNT, PTX)
             if PER_HIT:
-                q = sums + (start + i) * 16
+                q = sums + (start + i + u) * 16
                 tl.store(q + slot, first, mask=real)
                 tl.store(q + second_slot, second, mask=real & has_second)
             else:
                 q = sums + splat.to(tl.int64) * 16
-                tl.atomic_add(q + slot, first, mask=real & (first != 0) if NONZERO else real, sem="relaxed")
+                tl.atomic_add(q + slot, first, mask=real, sem="relaxed")
                 tl.atomic_add(q + second_slot, second, mask=real & has_second, sem="relaxed")
-            i += 1
-        alive = tl.max(tl.max(T, 1), 0) > T_MIN
+            u += 1
+        i += TILE
+        batch = following
+        following = later
+        longest = tl.where(tl.max(tl.max(T, 1), 0) > T_MIN, longest, 0)
 
 
 @functools.cache

@@ -45,7 +45,7 @@ def _splats(block: int, num_warps: int) -> dict[str, int]:
 # project, harmonics: a splat per thread, so that no thread repeats another's work. As few warps as can be where there are sums over the block:
 # one needs no step from warp to warp, and sums of more blocks to add up are a percent or two of what is read anyway. (project_backward in one
 # warp is compiled for 96 registers on sm_89, and spills.)
-# blend: splats between two looks at whether the tile is finished. Features: pixels, splats and channels of a matrix product, the largest that
+# Features: pixels, splats and channels of a matrix product, the largest that
 # spill on no target.
 LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "project": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
@@ -55,8 +55,8 @@ LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "bin": {"nvidia": _splats(64, 2), "cdna": _splats(64, 1), "rdna": _splats(64, 2)},
     "pick": {family: _splats(256, 1) for family in FAMILIES},
     "records": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
-    "blend": {family: {"UNROLL": 8, "num_warps": 1} for family in FAMILIES},
-    "blend_backward": {family: {"CHECK": 8, "NONZERO": 0, "num_warps": 1} for family in FAMILIES},
+    "blend": {family: {"num_warps": 1} for family in FAMILIES},
+    "blend_backward": {family: {"num_warps": 1} for family in FAMILIES},
     "features": {family: {"P": 64, "K": 16, "DB": 32, "num_warps": 8} for family in FAMILIES},
     "features_backward": {family: {"P": 64, "K": 16, "DB": 16, "num_warps": 8} for family in FAMILIES},
 }

@@ -19,14 +19,15 @@ from scenes import random_scene
 
 SPLATS = [{"BLOCK": block, "num_warps": warps} for block, warps in itertools.product((32, 64, 128, 256), (1, 2, 4)) if block >= 32 * warps]
 PRODUCTS = [{"P": 64, "K": k, "DB": d, "num_warps": w} for k, d, w in itertools.product((16, 32, 64), (16, 32, 64, 128), (4, 8))]
+REGISTERS: list[dict[str, int]] = [{}, {"maxnreg": 88}, {"maxnreg": 80}, {"maxnreg": 72}]
 CANDIDATES: dict[str, tuple[str, int, list[dict[str, int]]]] = {
     "project": ("project", 3, SPLATS),
     "project_backward": ("project_backward", 3, SPLATS),
     "bin": ("bin", 3, SPLATS),
-    "pick": ("bin", 3, [{"BLOCK": 32 * k * w, "num_warps": w} for k in (2, 4, 8, 16) for w in (1, 2, 4)]),
+    "pick": ("bin", 3, [{"BLOCK": b, "num_warps": w} for b in (32, 64, 128) for w in (1, 2) if b >= 32 * w]),
     "records": ("blend", 3, SPLATS),
-    "blend": ("blend", 3, [{"UNROLL": u, "num_warps": 1} for u in (1, 2, 4, 8, 16)]),
-    "blend_backward": ("blend_backward", 3, [{"CHECK": c, "NONZERO": z, "num_warps": 1} for c in (2, 8, 32) for z in (0, 1)]),
+    "blend": ("blend", 3, [{"UNROLL": u, "num_warps": 1} | r for u in (1, 2, 4, 8) for r in REGISTERS]),
+    "blend_backward": ("blend_backward", 3, [{"num_warps": 1} | r for r in REGISTERS]),
     "features": ("blend", 128, [c for c in PRODUCTS if c["DB"] >= 32]),
     "features_backward": ("blend_backward", 128, [c for c in PRODUCTS if c["DB"] <= 64 and c["K"] <= 32]),
 }

@@ -91,15 +91,17 @@ def count_hits(mx, my, a, b, c, level, det, half, real, W, H, TILE: tl.constexpr
 
 
 @triton.jit(do_not_specialize=["R", "W", "H"])
-def count_kernel(order, radii, means2d, conics, opacities, counts, R, W, H, EPS: tl.constexpr, TILE: tl.constexpr, SIDE: tl.constexpr,
+def count_kernel(radii, means2d, conics, opacities, counts, totals, R, W, H, EPS: tl.constexpr, TILE: tl.constexpr, SIDE: tl.constexpr,
                  BLOCK: tl.constexpr):
-    """Numbers of bins and of tiles that each splat hits, in depth order: counts `[2, R]`."""
+    """Number of bins that each splat hits, counts `[R]`, and of bins and of tiles that all do, added to totals `[2]`."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    splat = tl.load(order + i, mask=i < R, other=0)
-    real = visible(radii, splat, i < R)
-    mx, my, a, b, c, level, det, half = ellipse(means2d, conics, opacities, splat, real, H, EPS)
-    tl.store(counts + i, count_hits(mx, my, a, b, c, level, det, half, real, W, H, TILE * SIDE), mask=i < R)
-    tl.store(counts + R + i, count_hits(mx, my, a, b, c, level, det, half, real, W, H, TILE), mask=i < R)
+    real = visible(radii, i, i < R)
+    mx, my, a, b, c, level, det, half = ellipse(means2d, conics, opacities, i, real, H, EPS)
+    bins = count_hits(mx, my, a, b, c, level, det, half, real, W, H, TILE * SIDE)
+    tl.store(counts + i, bins, mask=i < R)
+    tiles = count_hits(mx, my, a, b, c, level, det, half, real, W, H, TILE)
+    tl.atomic_add(totals, tl.sum(bins.to(tl.int64), 0), sem="relaxed")
+    tl.atomic_add(totals + 1, tl.sum(tiles.to(tl.int64), 0), sem="relaxed")
 
 
 @triton.jit(do_not_specialize=["R", "N", "W", "H", "bins_x", "bins_y", "capacity"])
@@ -152,43 +154,42 @@ def mask_kernel(keys, by_bin, ids, means2d, conics, opacities, sorted_ids, masks
 @triton.jit(do_not_specialize=["M", "bins_x", "bins_y", "tiles_x", "tiles_y", "capacity"])
 def pick_kernel(edges, sorted_ids, masks, offsets, counts, ids, M, bins_x, bins_y, tiles_x, tiles_y, capacity, WRITE: tl.constexpr,
                 SIDE: tl.constexpr, BLOCK: tl.constexpr):
-    """A program per bin and tile of it. Number of its splats, after a first 0: counts `[tiles + 1]`; or (WRITE) the splats themselves, in
-    the order of the bin's list."""
+    """A program per bin and row of tiles in it. The numbers of their splats, after a first 0: counts `[tiles + 1]`; or (WRITE) the splats
+    themselves, in the order of the bin's list.
+
+    The 8 tiles are counted in the 8 bytes of one integer, whose running sum is the rank of each hit in its tile; BLOCK is below 256.
+    """
     bin = tl.program_id(0).to(tl.int64)
-    r = tl.program_id(1) // SIDE
-    c = tl.program_id(1) % SIDE
+    r = tl.program_id(1)
+    t = tl.arange(0, SIDE)[None, :]
     row = (bin // bins_x % bins_y).to(tl.int32) * SIDE + r
-    column = (bin % bins_x).to(tl.int32) * SIDE + c
-    inside = (row < tiles_y) & (column < tiles_x)
+    column = (bin % bins_x).to(tl.int32) * SIDE + t
+    inside = column < tl.where(row < tiles_y, tiles_x, 0)
     tile = (bin // (bins_x.to(tl.int64) * bins_y) * tiles_y + row) * tiles_x + column
     i = tl.load(edges + bin)
-    end = tl.where(inside, tl.load(edges + bin + 1), i)
-    lane = tl.arange(0, BLOCK)
-    if WRITE:
-        at = tl.load(offsets + tile, mask=inside, other=0)
-    else:
-        total = lane * 0
+    end = tl.where(row < tiles_y, tl.load(edges + bin + 1), i)
+    at = tl.load(offsets + tile, mask=inside, other=0) if WRITE else tile * 0                           # [1, 8]
     while i < end:
-        j = i + lane
-        bit = (tl.load(masks + r * M.to(tl.int64) + j, mask=j < end, other=0).to(tl.int32) >> c) & 1
+        j = i + tl.arange(0, BLOCK)[:, None]
+        mask = tl.load(masks + r * M.to(tl.int64) + j, mask=j < end, other=0).to(tl.int64)              # [BLOCK, 1]
+        # bit t to byte t, and any bit in a byte to 1: 0x0101.. copies the mask, 0x8040201008040201 picks, 0x7f7f.. carries to the top bit
+        ones = (((mask * 0x0101010101010101) & -0x7fbfdfeff7fbfdff) + 0x7f7f7f7f7f7f7f7f >> 7) & 0x0101010101010101
         if WRITE:
-            to = at + tl.cumsum(bit, 0) - 1
-            mask = (bit != 0) & (to < capacity)
-            tl.store(ids + to, tl.load(sorted_ids + j, mask=mask, other=0), mask=mask)
-            at += tl.sum(bit, 0)
-        else:
-            total += bit
+            to = at + ((tl.cumsum(ones, 0) >> (8 * t)) & 255) - 1                                       # [BLOCK, 8]
+            hit = (((mask >> t) & 1) != 0) & (to < capacity)
+            tl.store(ids + to, tl.load(sorted_ids + j, mask=mask != 0, other=0), mask=hit)
+        at += (tl.sum(ones, 0, keep_dims=True) >> (8 * t)) & 255
         i += BLOCK
     if not WRITE:
-        tl.store(counts + tile + 1, tl.sum(total, 0), mask=inside)
-        tl.store(counts, 0, mask=tile == 0)
+        tl.store(counts + 1 + tile, at.to(tl.int32), mask=inside)
+        tl.store(counts + tile, tl.zeros_like(tile).to(tl.int32), mask=tile == 0)
 
 
 def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
                ) -> tuple[Tensor, Tensor]:
     """Launcher; see `tsplat_reference.bin_splats`. One host sync, for the number of hits."""
     splats = _Splats(means2d, radii, conics, opacities, depths, width, height, tile)
-    return splats.lists(*splats.ends[:, -1].tolist()) if splats.R else splats.lists(0, 0)
+    return splats.lists(*splats.totals.tolist())
 
 
 def bin_splats_fixed(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int,
@@ -201,11 +202,11 @@ def bin_splats_fixed(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: 
     """
     splats = _Splats(means2d, radii, conics, opacities, depths, width, height, tile)
     ids, offsets = splats.lists(capacity, capacity)
-    return ids, offsets.clamp_(max=capacity), splats.ends[:, -1].amax() if splats.R else splats.ends.sum()
+    return ids, offsets.clamp_(max=capacity), splats.totals.amax()
 
 
 class _Splats:
-    """Splats in depth order, with their hits of bins and of tiles counted."""
+    """Splats with their hits of bins and of tiles counted."""
 
     def __init__(self, means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
                  ) -> None:
@@ -214,37 +215,39 @@ class _Splats:
         (self.C, self.N), self.R = opacities.shape, opacities.numel()
         self.size, self.tiles = (width, height), (ceil_div(width, tile), ceil_div(height, tile))
         self.bins = ceil_div(self.tiles[0], SIDE.value), ceil_div(self.tiles[1], SIDE.value)
-        self.depth_order = depths.flatten().sort(stable=True).indices                       # a radix sort of 4 passes
         self.radii, self.shapes = radii.contiguous(), (means2d.contiguous(), conics.contiguous(), opacities.contiguous())
         self.options = {"EPS": torch.finfo(means2d.dtype).eps, "TILE": tile, "SIDE": SIDE.value, **launch("bin"), "enable_fp_fusion": True}
         self.programs = ceil_div(self.R, self.options["BLOCK"])
-        self.counts = torch.empty(2, self.R, dtype=torch.int32, device=means2d.device)
+        self.counts = torch.empty(self.R, dtype=torch.int32, device=means2d.device)
+        self.totals = torch.zeros(2, dtype=torch.int64, device=means2d.device)
         if self.R:
-            count_kernel[(self.programs,)](self.depth_order, self.radii, *self.shapes, self.counts, self.R, *self.size, **self.options)
-        self.ends = self.counts.cumsum(1)                                                   # int64: more than 2^31 hits are counted right
+            count_kernel[(self.programs,)](self.radii, *self.shapes, self.counts, self.totals, self.R, *self.size, **self.options)
+        self.depth_order = depths.flatten().sort(stable=True).indices                       # a radix sort of 4 passes
 
     def lists(self, coarse: int, fine: int) -> tuple[Tensor, Tensor]:
         """Ids and offsets, with room for so many hits of bins and of tiles; hits beyond are left out."""
         device, bins = self.counts.device, self.C * self.bins[0] * self.bins[1]
-        counts = torch.empty(self.C * self.tiles[0] * self.tiles[1] + 1, dtype=torch.int32, device=device)
+        tile_counts = torch.empty(self.C * self.tiles[0] * self.tiles[1] + 1, dtype=torch.int32, device=device)
         # zeros, as deterministic blending reads ids beyond the last offset, which there are in a fixed capacity
         ids = torch.zeros(fine, dtype=torch.int32, device=device)
         if not (self.R and coarse):
-            return ids, counts.zero_().to(torch.int64)
+            return ids, tile_counts.zero_().to(torch.int64)
+        counts = self.counts.index_select(0, self.depth_order)
+        ends = counts.cumsum(0)                                                             # int64: more than 2^31 hits are counted right
         narrow = next(d for d in (torch.int16, torch.int32, torch.int64) if bins <= torch.iinfo(d).max)
         keys = torch.full((coarse,), bins, dtype=narrow, device=device)                     # what is not overwritten is room beyond the hits
         unsorted = torch.empty(coarse, dtype=torch.int32, device=device)
-        emit_kernel[(self.programs,)](self.depth_order, self.radii, *self.shapes, self.counts, self.ends, keys, unsorted, self.R, self.N,
+        emit_kernel[(self.programs,)](self.depth_order, self.radii, *self.shapes, counts, ends, keys, unsorted, self.R, self.N,
                                       *self.size, *self.bins, coarse, **self.options)
         keys, by_bin = keys.sort(stable=True)                                               # int16 keys: 2 passes
         edges = torch.searchsorted(keys, torch.arange(bins + 1, device=device, dtype=narrow))
         sorted_ids, masks = torch.empty_like(unsorted), torch.empty(SIDE.value, coarse, dtype=torch.uint8, device=device)
         mask_kernel[(ceil_div(coarse, self.options["BLOCK"]),)](keys, by_bin, unsorted, *self.shapes, sorted_ids, masks, coarse, bins,
                                                                 *self.bins, *self.size, **self.options)
-        del unsorted, by_bin, keys
-        grid, options = (bins, SIDE.value**2), {"SIDE": SIDE.value, **launch("pick")}
+        del unsorted, by_bin, keys, counts, ends
+        grid, options = (bins, SIDE.value), {"SIDE": SIDE.value, **launch("pick")}
         lists = edges, sorted_ids, masks
-        pick_kernel[grid](*lists, counts, counts, ids, coarse, *self.bins, *self.tiles, fine, WRITE=False, **options)
-        offsets = counts.cumsum(0)
-        pick_kernel[grid](*lists, offsets, counts, ids, coarse, *self.bins, *self.tiles, fine, WRITE=True, **options)
+        pick_kernel[grid](*lists, tile_counts, tile_counts, ids, coarse, *self.bins, *self.tiles, fine, WRITE=False, **options)
+        offsets = tile_counts.cumsum(0)
+        pick_kernel[grid](*lists, offsets, tile_counts, ids, coarse, *self.bins, *self.tiles, fine, WRITE=True, **options)
         return ids, offsets

@@ -155,7 +155,7 @@ def splat_alpha(mx, my, l00, l10, l11, log2_opacity, x, y, T, log2_alpha: tl.con
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null"])
 def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, W, H, tiles_x, tiles_y, null, D: tl.constexpr,
                      BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, LANES: tl.constexpr,
-                     PTX: tl.constexpr):
+                     UNROLL: tl.constexpr, PTX: tl.constexpr):
     """Image `[C, H, W, D]` and alpha `[C, H, W]` of a block of tiles."""
     view, tile, exists, x, y, cx, cy, column4, pixel4 = tile_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
     T = glue(tl.where(column4 < W, 1.0, 0.0), tl.where(column4 + 1 < W, 1.0, 0.0)) + x * 0.0     # beyond the border finished
@@ -170,18 +170,21 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
     while i < longest:
         later = load_batch(ids, start, i + 2 * TILE, hits, null)        # two batches ahead, so that nothing waits for it
         prefetch_records(records, following, PTX)
-        for u in tl.static_range(TILE):
-            splat = of_batch(batch, u, ids, start, i, hits, null, PTX)
-            r = load_record(records, splat, D)
-            w = T * splat_alpha(r[0] - cx, r[1] - cy, r[2], r[3], r[4], r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
-            C0 += r[6] * w
-            if D > 1:
-                C1 += r[7] * w
-            if D > 2:
-                C2 += r[8] * w
-            if D > 3:
-                C3 += r[9] * w
-            T -= w
+        u = 0
+        while u < TILE:
+            for v in tl.static_range(UNROLL):
+                splat = of_batch(batch, u + v, ids, start, i, hits, null, PTX)
+                r = load_record(records, splat, D)
+                w = T * splat_alpha(r[0] - cx, r[1] - cy, r[2], r[3], r[4], r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
+                C0 += r[6] * w
+                if D > 1:
+                    C1 += r[7] * w
+                if D > 2:
+                    C2 += r[8] * w
+                if D > 3:
+                    C3 += r[9] * w
+                T -= w
+            u += UNROLL
         i += TILE
         batch = following
         following = later

@@ -104,9 +104,9 @@ def test_opcheck_of_every_op() -> None:
     with kernels():
         with record(calls):
             values_and_gradients(render, leaves)
-        assert set(calls) == {op._qualname for op in OPS}
+        assert set(calls) == {op.custom._qualname for op in OPS}
         for op in OPS:
-            opcheck(op, calls[op._qualname], test_utils=("test_schema", "test_faketensor"))
+            opcheck(op.custom, calls[op.custom._qualname], test_utils=("test_schema", "test_faketensor"))
 
 
 @contextlib.contextmanager

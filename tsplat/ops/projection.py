@@ -7,10 +7,9 @@ from typing import Any
 import torch
 import tsplat_reference as reference
 from torch import Tensor
-from torch.library import custom_op
 from tsplat_reference import Projection
 
-from tsplat.ops.common import contiguous, register_autocast, register_loop_vmap, reject_forward_mode, run_kernel, second_derivative
+from tsplat.ops.common import Op, contiguous, run_kernel, second_derivative
 
 Five = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -19,14 +18,12 @@ Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor, viewmats: Tensor,
             Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float, antialiased: bool) -> Projection:
     """`tsplat_reference.project` as an op, with gradients to means, quats, scales, covars, viewmats and Ks."""
-    reject_forward_mode("project", means, quats, scales, covars, opacities, viewmats, Ks)
     return Projection(*project_op(means, quats, scales, covars, opacities, viewmats, Ks, width, height, model, near, far, eps2d,
                                   antialiased))
 
 
-@custom_op("tsplat::project", mutates_args=())
-def project_op(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor, viewmats: Tensor,
-               Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float, antialiased: bool) -> Five:
+def _project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor, viewmats: Tensor,
+             Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float, antialiased: bool) -> Five:
     """radii, means2d, depths, conics, compensations."""
     radii, means2d, depths, conics, compensations = run_kernel(
         "projection", "project", means, means, quats, scales, covars, opacities, viewmats, Ks, width, height, model, near, far, eps2d,
@@ -34,24 +31,21 @@ def project_op(means: Tensor, quats: Tensor | None, scales: Tensor | None, covar
     return radii, means2d, depths, conics, compensations
 
 
-@custom_op("tsplat::project_backward", mutates_args=())
-def project_backward_op(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
-                        viewmats: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float,
-                        antialiased: bool, radii: Tensor, v_means2d: Tensor, v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor
-                        ) -> Six:
+def _project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
+                      viewmats: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float,
+                      antialiased: bool, radii: Tensor, v_means2d: Tensor, v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor
+                      ) -> Six:
     """Gradients of means, quats, scales, covars, viewmats and Ks, empty for those that are None."""
     return _some_empty(means, run_kernel(
         "projection", "project_backward", means, means, quats, scales, covars, viewmats, Ks, width, height, model, eps2d, antialiased,
         radii, v_means2d, v_depths, v_conics, v_compensations))
 
 
-@project_op.register_kernel("cpu")
 def _project_cpu(*args: Any) -> Five:
     radii, means2d, depths, conics, compensations = reference.project(*args)
     return radii, means2d, depths, conics, compensations
 
 
-@project_backward_op.register_kernel("cpu")
 @contiguous
 def _project_backward_cpu(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
                           viewmats: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float,
@@ -65,14 +59,12 @@ def _some_empty(means: Tensor, results: tuple[Tensor | None, ...]) -> Six:
     return tuple(means.new_empty(0) if r is None else r for r in results)  # type: ignore[return-value]
 
 
-@project_op.register_fake
 def _project_fake(means: Tensor, quats: Any, scales: Any, covars: Any, opacities: Any, viewmats: Tensor, *_: Any) -> Five:
     shape = viewmats.shape[0], means.shape[0]
     return (means.new_empty(*shape, 2, dtype=torch.int32), means.new_empty(*shape, 2), means.new_empty(*shape), means.new_empty(*shape, 3),
             means.new_empty(*shape))
 
 
-@project_backward_op.register_fake
 def _project_backward_fake(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
                            viewmats: Tensor, Ks: Tensor, *_: Any) -> Six:
     inputs = means, quats, scales, covars, viewmats, Ks
@@ -109,7 +101,6 @@ def _double_backward(ctx: Any, *v_gradients: Tensor) -> tuple[Any, ...]:
     return *v_inputs[:4], None, *v_inputs[4:], *[None] * 8, *v_cotangents
 
 
-project_op.register_autograd(_backward, setup_context=_save)
-project_backward_op.register_autograd(_double_backward, setup_context=_save_backward)
-register_autocast(project_op, project_backward_op)
-register_loop_vmap(project_op, project_backward_op)
+project_op = Op("tsplat::project", _project, cpu=_project_cpu, fake=_project_fake, setup=_save, backward=_backward, vmap=True)
+project_backward_op = Op("tsplat::project_backward", _project_backward, cpu=_project_backward_cpu, fake=_project_backward_fake,
+                         setup=_save_backward, backward=_double_backward, vmap=True)

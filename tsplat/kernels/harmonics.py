@@ -14,7 +14,7 @@ import triton.language as tl
 from torch import Tensor
 
 from tsplat.kernels.camera import dot, load_row, stack, store_row
-from tsplat.kernels.launch import ceil_div, launch, on_device_of
+from tsplat.kernels.launch import Launcher, ceil_div, launch
 
 HELD = 50
 """Coefficients that a thread holds at the most if there are more than 3 channels; from 64 on, some targets run out of registers."""
@@ -165,6 +165,7 @@ def load_coefficients(p, wanted, USED: tl.constexpr, D: tl.constexpr, CHANNELS: 
         return v
 
 
+@Launcher
 @triton.jit(do_not_specialize=["N", "C"])
 def harmonics_fwd_kernel(means, centers, coeffs, mask, out, N, C, K: tl.constexpr, D: tl.constexpr, DEGREE: tl.constexpr,
                          CHANNELS: tl.constexpr, CHUNK: tl.constexpr, BLOCK: tl.constexpr):
@@ -189,6 +190,7 @@ def harmonics_fwd_kernel(means, centers, coeffs, mask, out, N, C, K: tl.constexp
         camera += 1
 
 
+@Launcher
 @triton.jit(do_not_specialize=["N", "C"])
 def harmonics_bwd_kernel(means, centers, coeffs, mask, v_out, v_means, v_coeffs, partial_centers, N, C, K: tl.constexpr, D: tl.constexpr,
                          DEGREE: tl.constexpr, CHANNELS: tl.constexpr, CHUNK: tl.constexpr, BLOCK: tl.constexpr):
@@ -257,10 +259,9 @@ def harmonics(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask:
         return out
     options = launch("harmonics")
     channels, chunk = _group(K, D, degree)
-    with on_device_of(means):
-        harmonics_fwd_kernel[(ceil_div(N, options["BLOCK"]), D // channels)](
-            means.contiguous(), centers.contiguous(), coeffs.contiguous(), mask.contiguous(), out, N, C, K=K, D=D, DEGREE=degree,
-            CHANNELS=channels, CHUNK=chunk, **options, enable_fp_fusion=True)
+    harmonics_fwd_kernel[(ceil_div(N, options["BLOCK"]), D // channels)](
+        means.contiguous(), centers.contiguous(), coeffs.contiguous(), mask.contiguous(), out, N, C, K=K, D=D, DEGREE=degree,
+        CHANNELS=channels, CHUNK=chunk, **options, enable_fp_fusion=True)
     return out
 
 
@@ -277,10 +278,9 @@ def harmonics_backward(means: Tensor, centers: Tensor, coeffs: Tensor, degree: i
     v_coeffs = torch.empty_like(coeffs) if (degree + 1) ** 2 == K else torch.zeros_like(coeffs)
     v_means = means.new_empty(groups, N, 3)
     partial_centers = means.new_empty(groups * programs, C, 4)
-    with on_device_of(means):
-        harmonics_bwd_kernel[(programs, groups)](
-            means, centers, coeffs, mask.contiguous(), v_out.contiguous(), v_means, v_coeffs, partial_centers, N, C, K=K, D=D,
-            DEGREE=degree, CHANNELS=channels, CHUNK=chunk, **options, enable_fp_fusion=True)
+    harmonics_bwd_kernel[(programs, groups)](
+        means, centers, coeffs, mask.contiguous(), v_out.contiguous(), v_means, v_coeffs, partial_centers, N, C, K=K, D=D,
+        DEGREE=degree, CHANNELS=channels, CHUNK=chunk, **options, enable_fp_fusion=True)
     if degree == 0:
         return torch.zeros_like(means), torch.zeros_like(centers), v_coeffs
     return v_means[0] if groups == 1 else v_means.sum(0), -partial_centers.sum(0)[:, :3], v_coeffs

@@ -26,7 +26,7 @@ from tsplat.kernels.camera import (
     transform,
     transform_transposed,
 )
-from tsplat.kernels.launch import ceil_div, launch, on_device_of
+from tsplat.kernels.launch import Launcher, ceil_div, launch
 
 SUMS = 16
 """Camera gradients of a block of splats: the rows of W | t, then fx, fy, cx, cy."""
@@ -142,6 +142,7 @@ def half_size(extent, variance):
     return tl.minimum(tl.ceil(extent * tl.sqrt(tl.where(variance < 1e18, variance, 1e18))), 1073741824.0)
 
 
+@Launcher
 @triton.jit(do_not_specialize=["N", "C", "width", "height"])
 def project_fwd_kernel(means, quats, scales, covars, opacities, viewmats, Ks, radii, means2d, depths, conics, compensations, N, C, width,
                        height, near: tl.float64, far: tl.float64, eps2d: tl.float64, MODEL: tl.constexpr, ANTIALIASED: tl.constexpr,
@@ -210,6 +211,7 @@ def add_outer(A, u, v):
     return combine(1.0, A[0], u[0], v), combine(1.0, A[1], u[1], v), combine(1.0, A[2], u[2], v)
 
 
+@Launcher
 @triton.jit(do_not_specialize=["N", "C", "width", "height"])
 def project_bwd_kernel(means, quats, scales, covars, viewmats, Ks, radii, v_means2d, v_depths, v_conics, v_compensations, v_means, v_quats,
                        v_scales, v_covars, partials, N, C, width, height, eps2d: tl.float64, MODEL: tl.constexpr, ANTIALIASED: tl.constexpr,
@@ -305,12 +307,11 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
     means2d, depths, conics, compensations = (means.new_empty(C, N, *s) for s in ((2,), (), (3,), ()))
     if C * N > 0:
         options = launch("project")
-        with on_device_of(means):
-            project_fwd_kernel[(ceil_div(N, options["BLOCK"]) * C,)](
-                means.contiguous(), *map(_contiguous, (quats, scales, covars)), opacities.contiguous(), viewmats.contiguous(),
-                Ks.contiguous(), radii, means2d, depths, conics, compensations, N, C, width, height, near, far, eps2d, MODEL=model,
-                ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, ALPHA_MIN=ALPHA_MIN, EXTENT_MAX=EXTENT_MAX,
-                LARGEST=LARGEST, **options, enable_fp_fusion=True)
+        project_fwd_kernel[(ceil_div(N, options["BLOCK"]) * C,)](
+            means.contiguous(), *map(_contiguous, (quats, scales, covars)), opacities.contiguous(), viewmats.contiguous(),
+            Ks.contiguous(), radii, means2d, depths, conics, compensations, N, C, width, height, near, far, eps2d, MODEL=model,
+            ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, ALPHA_MIN=ALPHA_MIN, EXTENT_MAX=EXTENT_MAX,
+            LARGEST=LARGEST, **options, enable_fp_fusion=True)
     return radii, means2d, depths, conics, compensations
 
 
@@ -328,12 +329,11 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
     if C * N > 0:
         options = launch("project_backward")
         partials = means.new_empty(ceil_div(N, options["BLOCK"]), C, SUMS)
-        with on_device_of(means):
-            project_bwd_kernel[(len(partials),)](
-                means, quats, scales, covars, viewmats, Ks, radii.contiguous(), v_means2d.contiguous(), v_depths.contiguous(),
-                v_conics.contiguous(), v_compensations.contiguous(), v_means, v_quats, v_scales, v_covars, partials, N, C, width, height,
-                eps2d, MODEL=model, ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, LARGEST=LARGEST, SUMS=SUMS,
-                **options, enable_fp_fusion=True)
+        project_bwd_kernel[(len(partials),)](
+            means, quats, scales, covars, viewmats, Ks, radii.contiguous(), v_means2d.contiguous(), v_depths.contiguous(),
+            v_conics.contiguous(), v_compensations.contiguous(), v_means, v_quats, v_scales, v_covars, partials, N, C, width, height,
+            eps2d, MODEL=model, ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, LARGEST=LARGEST, SUMS=SUMS,
+            **options, enable_fp_fusion=True)
         sums = partials.sum(0)                          # [C, SUMS]
         v_viewmats[:, :3] = sums[:, :12].view(C, 3, 4)
         v_Ks.diagonal(0, 1, 2)[:, :2] = sums[:, 12:14]

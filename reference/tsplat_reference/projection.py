@@ -112,7 +112,7 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
 
 
 class ProjectionGradients(NamedTuple):
-    """Gradients of the arguments of `project`, None where the argument is None."""
+    """Gradients of the arguments of `project`, None where the argument is None; `[0, 4, 4]` and `[0, 3, 3]` of cameras if not asked for."""
 
     means: Tensor
     quats: Tensor | None
@@ -124,12 +124,12 @@ class ProjectionGradients(NamedTuple):
 
 def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, viewmats: Tensor, Ks: Tensor,
                      width: int, height: int, model: str, eps2d: float, antialiased: bool, radii: Tensor, v_means2d: Tensor,
-                     v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor) -> ProjectionGradients:
-    """Closed-form gradients of `project`, of which `radii` says what was culled."""
+                     v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor, cameras: bool = True) -> ProjectionGradients:
+    """Closed-form gradients of `project`, of which `radii` says what was culled; those of viewmats and Ks if `cameras`."""
     if means.shape[0] > CHUNK:
         parts = map_chunks(lambda rows: project_backward(
             means[rows], _at(quats, rows), _at(scales, rows), _at(covars, rows), viewmats, Ks, width, height, model, eps2d, antialiased,
-            radii[:, rows], v_means2d[:, rows], v_depths[:, rows], v_conics[:, rows], v_compensations[:, rows]), means.shape[0], CHUNK)
+            radii[:, rows], v_means2d[:, rows], v_depths[:, rows], v_conics[:, rows], v_compensations[:, rows], cameras), means.shape[0], CHUNK)
         return ProjectionGradients(torch.cat([p.means for p in parts]), _cat([p.quats for p in parts]), _cat([p.scales for p in parts]),
                                    _cat([p.covars for p in parts]), torch.stack([p.viewmats for p in parts]).sum(0),
                                    torch.stack([p.Ks for p in parts]).sum(0))
@@ -166,8 +166,8 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
     v_x, v_y, v_z = (torch.where(valid, v, 0.0) for v in (*v_p[:2], v_p[2] + v_depths))
 
     # p = W mean + t
-    v_viewmats = torch.zeros_like(viewmats)
-    for i, v in enumerate((v_x, v_y, v_z)):
+    v_viewmats, v_Ks = (torch.zeros_like(viewmats), v_Ks) if cameras else (viewmats.new_empty(0, 4, 4), Ks.new_empty(0, 3, 3))
+    for i, v in enumerate((v_x, v_y, v_z) if cameras else ()):
         for j in range(3):
             v_viewmats[:, i, j] = total(v_W[i][j], det) + v @ means[:, j]
         v_viewmats[:, i, 3] = v.sum(1)

@@ -217,7 +217,7 @@ def project_bwd_kernel(means, quats, scales, covars, viewmats, Ks, radii, v_mean
                        v_scales, v_covars, partials, N, C, width, height, eps2d: tl.float64, MODEL: tl.constexpr, ANTIALIASED: tl.constexpr,
                        MARGIN: tl.constexpr, FLOOR: tl.constexpr, LARGEST: tl.constexpr, SUMS: tl.constexpr, BLOCK: tl.constexpr):
     """One block of splats, all cameras in turn: sums over cameras in registers, in a fixed order; sums over the block for each camera to
-    `[programs, C, SUMS]`, which torch adds up. No atomics: the same bits in every run.
+    `[programs, C, SUMS]`, which torch adds up, if there are such. No atomics: the same bits in every run.
 
     Nothing that was culled can do harm: a splat that no camera sees is not read (its shape is 0), the point of a pair that was culled is
     (0, 0, 1), and what comes from above is 0 for it.
@@ -283,10 +283,11 @@ def project_bwd_kernel(means, quats, scales, covars, viewmats, Ks, radii, v_mean
                                                    MARGIN)
         v_p = (v_p[0], v_p[1], v_p[2] + tl.load(v_depths + row, mask=valid, other=0.0))
         v_mean = combine(1.0, v_mean, 1.0, transform_transposed(W, v_p))
-        v_W = (combine(J0[0], v_M0, J1[0], v_M1), combine(J0[1], v_M0, J1[1], v_M1), combine(J0[2], v_M0, J1[2], v_M1))
-        v_W = add_outer(v_W, v_p, mean)
-        sums = tl.sum(stack(v_W[0] + (v_p[0],) + v_W[1] + (v_p[1],) + v_W[2] + (v_p[2],) + v_intrinsics, SUMS), 0)
-        tl.store(partials + (tl.program_id(0).to(tl.int64) * C + camera) * SUMS + tl.arange(0, SUMS), sums)
+        if partials is not None:
+            v_W = (combine(J0[0], v_M0, J1[0], v_M1), combine(J0[1], v_M0, J1[1], v_M1), combine(J0[2], v_M0, J1[2], v_M1))
+            v_W = add_outer(v_W, v_p, mean)
+            sums = tl.sum(stack(v_W[0] + (v_p[0],) + v_W[1] + (v_p[1],) + v_W[2] + (v_p[2],) + v_intrinsics, SUMS), 0)
+            tl.store(partials + (tl.program_id(0).to(tl.int64) * C + camera) * SUMS + tl.arange(0, SUMS), sums)
         camera += 1
 
     store_row(v_means + n * 3, v_mean, inside, 3, 1)
@@ -317,7 +318,7 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
 
 def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, viewmats: Tensor, Ks: Tensor,
                      width: int, height: int, model: str, eps2d: float, antialiased: bool, radii: Tensor, v_means2d: Tensor,
-                     v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor
+                     v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor, cameras: bool = True
                      ) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor | None, Tensor, Tensor]:
     """Launcher; see `tsplat_reference.project_backward`."""
     C, N = len(viewmats), len(means)
@@ -325,19 +326,21 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
     quats, scales, covars = map(_contiguous, (quats, scales, covars))
     new = torch.empty_like if C * N > 0 else torch.zeros_like
     v_means, (v_quats, v_scales, v_covars) = new(means), (None if x is None else new(x) for x in (quats, scales, covars))
-    v_viewmats, v_Ks = torch.zeros_like(viewmats), torch.zeros_like(Ks)
+    v_viewmats, v_Ks = (torch.zeros_like(viewmats), torch.zeros_like(Ks)) if cameras else (viewmats.new_empty(0, 4, 4), Ks.new_empty(0, 3, 3))
     if C * N > 0:
         options = launch("project_backward")
-        partials = means.new_empty(ceil_div(N, options["BLOCK"]), C, SUMS)
-        project_bwd_kernel[(len(partials),)](
+        programs = ceil_div(N, options["BLOCK"])
+        partials = means.new_empty(programs, C, SUMS) if cameras else None
+        project_bwd_kernel[(programs,)](
             means, quats, scales, covars, viewmats, Ks, radii.contiguous(), v_means2d.contiguous(), v_depths.contiguous(),
             v_conics.contiguous(), v_compensations.contiguous(), v_means, v_quats, v_scales, v_covars, partials, N, C, width, height,
             eps2d, MODEL=model, ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, LARGEST=LARGEST, SUMS=SUMS,
             **options, enable_fp_fusion=True)
-        sums = partials.sum(0)                          # [C, SUMS]
-        v_viewmats[:, :3] = sums[:, :12].view(C, 3, 4)
-        v_Ks.diagonal(0, 1, 2)[:, :2] = sums[:, 12:14]
-        v_Ks[:, :2, 2] = sums[:, 14:]
+        if partials is not None:
+            sums = partials.sum(0)                      # [C, SUMS]
+            v_viewmats[:, :3] = sums[:, :12].view(C, 3, 4)
+            v_Ks.diagonal(0, 1, 2)[:, :2] = sums[:, 12:14]
+            v_Ks[:, :2, 2] = sums[:, 14:]
     return v_means, v_quats, v_scales, v_covars, v_viewmats, v_Ks
 
 

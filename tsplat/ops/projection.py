@@ -33,12 +33,12 @@ def _project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars:
 
 def _project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
                       viewmats: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float,
-                      antialiased: bool, radii: Tensor, v_means2d: Tensor, v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor
-                      ) -> Six:
-    """Gradients of means, quats, scales, covars, viewmats and Ks, empty for those that are None."""
+                      antialiased: bool, radii: Tensor, v_means2d: Tensor, v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor,
+                      cameras: bool = True) -> Six:
+    """Gradients of means, quats, scales, covars, viewmats and Ks, empty for those that are None, and without `cameras` for the last two."""
     return _some_empty(means, run_kernel(
         "projection", "project_backward", means, means, quats, scales, covars, viewmats, Ks, width, height, model, eps2d, antialiased,
-        radii, v_means2d, v_depths, v_conics, v_compensations))
+        radii, v_means2d, v_depths, v_conics, v_compensations, cameras))
 
 
 def _project_cpu(*args: Any) -> Five:
@@ -49,7 +49,7 @@ def _project_cpu(*args: Any) -> Five:
 @contiguous
 def _project_backward_cpu(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
                           viewmats: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float,
-                          antialiased: bool, *gradients: Tensor) -> Six:
+                          antialiased: bool, *gradients: Any) -> Six:
     return _some_empty(means, reference.project_backward(
         means, quats, scales, covars, viewmats, Ks, width, height, model, eps2d, antialiased, *gradients))
 
@@ -66,8 +66,10 @@ def _project_fake(means: Tensor, quats: Any, scales: Any, covars: Any, opacities
 
 
 def _project_backward_fake(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
-                           viewmats: Tensor, Ks: Tensor, *_: Any) -> Six:
-    inputs = means, quats, scales, covars, viewmats, Ks
+                           viewmats: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float,
+                           antialiased: bool, radii: Tensor, v_means2d: Tensor, v_depths: Tensor, v_conics: Tensor,
+                           v_compensations: Tensor, cameras: bool = True) -> Six:
+    inputs = means, quats, scales, covars, *((viewmats, Ks) if cameras else (viewmats[:0], Ks[:0]))
     return tuple(means.new_empty(0 if x is None else x.shape) for x in inputs)  # type: ignore[return-value]
 
 
@@ -80,15 +82,15 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: Five) -> None:
 
 def _backward(ctx: Any, _: Any, *gradients: Tensor) -> tuple[Any, ...]:
     *tensors, radii = ctx.saved_tensors
-    results = project_backward_op(*tensors, *ctx.options, radii, *(v.contiguous() for v in gradients))
-    v_means, v_quats, v_scales, v_covars, v_viewmats, v_Ks = (
-        None if x is None else r for x, r in zip((*tensors[:4], *tensors[5:]), results, strict=True))
-    return v_means, v_quats, v_scales, v_covars, None, v_viewmats, v_Ks, *[None] * 7
+    cameras = any(ctx.needs_input_grad[5:7])            # seldom wanted, and 8 more operations of torch
+    results = project_backward_op(*tensors, *ctx.options, radii, *(v.contiguous() for v in gradients), cameras)
+    v_shapes = (None if x is None else r for x, r in zip(tensors[:4], results, strict=False))
+    return *v_shapes, None, *(results[4:] if cameras else (None, None)), *[None] * 7
 
 
 def _save_backward(ctx: Any, inputs: tuple[Any, ...], output: Six) -> None:
-    ctx.options = inputs[7:14]
-    ctx.save_for_backward(*inputs[:7], *inputs[15:])
+    ctx.options, ctx.cameras = inputs[7:14], all(inputs[19:])
+    ctx.save_for_backward(*inputs[:7], *inputs[15:19])
 
 
 def _double_backward(ctx: Any, *v_gradients: Tensor) -> tuple[Any, ...]:
@@ -97,8 +99,9 @@ def _double_backward(ctx: Any, *v_gradients: Tensor) -> tuple[Any, ...]:
     def forward(means: Tensor, quats: Any, scales: Any, covars: Any, viewmats: Tensor, Ks: Tensor) -> list[Tensor]:
         return list(reference.project(means, quats, scales, covars, opacities, viewmats, Ks, *ctx.options)[1:])
 
-    v_inputs, v_cotangents = second_derivative(forward, (means, quats, scales, covars, viewmats, Ks), cotangents, v_gradients)
-    return *v_inputs[:4], None, *v_inputs[4:], *[None] * 8, *v_cotangents
+    v_inputs, v_cotangents = second_derivative(forward, (means, quats, scales, covars, viewmats, Ks), cotangents,
+                                               v_gradients if ctx.cameras else (*v_gradients[:4], None, None))
+    return *v_inputs[:4], None, *v_inputs[4:], *[None] * 8, *v_cotangents, None
 
 
 project_op = Op("tsplat::project", _project, cpu=_project_cpu, fake=_project_fake, setup=_save, backward=_backward, vmap=True)

@@ -63,10 +63,12 @@ def blend_arguments(n: int = 6, background: bool = True, absgrad: bool = True, s
             torch.zeros_like(s.means2d) if absgrad else None, *bins, WIDTH, HEIGHT, TILE, 0.99)
 
 
-def project_backward_arguments(antialiased: bool = True, covars: bool = False, n: int = 6, cameras: bool = True) -> tuple[Any, ...]:
+def project_backward_arguments(antialiased: bool = True, covars: bool = False, n: int = 6, cameras: bool = True, sparse: bool = False
+                               ) -> tuple[Any, ...]:
     args = project_arguments(antialiased, covars, n)
     radii, *outputs = reference.project(*args)
-    return *args, radii, *(torch.randn_like(x) for x in outputs), cameras
+    v_means2d, v_depths, v_conics, v_compensations = (torch.randn_like(x) for x in outputs)
+    return *args, radii, v_means2d, None if sparse else v_depths, v_conics, None if sparse else v_compensations, cameras
 
 
 def harmonics_backward_arguments(degree: int = 2, n: int = 6, cameras: bool = True) -> tuple[Any, ...]:
@@ -90,6 +92,7 @@ CASES: dict[str, tuple[Any, Callable[..., tuple[Any, ...]], dict[str, Any]]] = {
                                  {"covars": True, "antialiased": False}),
     "project_backward, N = 0": (projection.project_backward_op, project_backward_arguments, {"n": 0}),
     "project_backward, fixed cameras": (projection.project_backward_op, project_backward_arguments, {"cameras": False}),
+    "project_backward, sparse": (projection.project_backward_op, project_backward_arguments, {"sparse": True}),
     "harmonics": (harmonics.harmonics_op, harmonics_arguments, {}),
     "harmonics, degree 0": (harmonics.harmonics_op, harmonics_arguments, {"degree": 0}),
     "harmonics, N = 0": (harmonics.harmonics_op, harmonics_arguments, {"n": 0}),
@@ -235,6 +238,21 @@ def test_expanded_upstream_gradients(backend: Backend, name: str) -> None:
     outputs = call(*inputs)
     dense = torch.autograd.grad(outputs, inputs, [torch.ones_like(o) for o in outputs], retain_graph=True)
     assert_same_bits(torch.autograd.grad(sum(o.sum() for o in outputs), inputs), dense)
+
+
+@pytest.mark.parametrize("which", range(1, 5))
+def test_upstream_gradients_that_are_absent_are_zeros(backend: Backend, which: int) -> None:
+    """Of one output of the projection at a time; the first derivative and the second."""
+    _, args = case("project", backend)
+    args = require_grad(args, (4,))
+    inputs = [a for a in args if isinstance(a, Tensor) and a.requires_grad]
+    found = []
+    for zeros in (False, True):
+        outputs = ops.project(*args)
+        loss = sum((x.square().sum() * (i == which) for i, x in enumerate(outputs) if i > 0 and (zeros or i == which)), torch.zeros(()))
+        v = torch.autograd.grad(loss, inputs, create_graph=True)
+        found.append([*v, *torch.autograd.grad(sum(x.square().sum() for x in v), inputs)])
+    assert_close(*found, 1e-14)
 
 
 def test_the_order_of_splats_has_no_gradient_and_needs_none(backend: Backend) -> None:

@@ -214,8 +214,8 @@ def add_outer(A, u, v):
 @Launcher
 @triton.jit(do_not_specialize=["N", "C", "width", "height"])
 def project_bwd_kernel(means, quats, scales, covars, viewmats, Ks, radii, v_means2d, v_depths, v_conics, v_compensations, v_means, v_quats,
-                       v_scales, v_covars, partials, N, C, width, height, eps2d: tl.float64, MODEL: tl.constexpr, ANTIALIASED: tl.constexpr,
-                       MARGIN: tl.constexpr, FLOOR: tl.constexpr, LARGEST: tl.constexpr, SUMS: tl.constexpr, BLOCK: tl.constexpr):
+                       v_scales, v_covars, partials, N, C, width, height, eps2d: tl.float64, MODEL: tl.constexpr, MARGIN: tl.constexpr,
+                       FLOOR: tl.constexpr, LARGEST: tl.constexpr, SUMS: tl.constexpr, BLOCK: tl.constexpr):
     """One block of splats, all cameras in turn: sums over cameras in registers, in a fixed order; sums over the block for each camera to
     `[programs, C, SUMS]`, which torch adds up, if there are such. No atomics: the same bits in every run.
 
@@ -255,7 +255,7 @@ def project_bwd_kernel(means, quats, scales, covars, viewmats, Ks, radii, v_mean
         v_a = -(qa * qa * v_A + qa * qb * v_B + qb * qb * v_C)
         v_b = -(2.0 * qa * qb * v_A + (qa * qc + qb * qb) * v_B + 2.0 * qb * qc * v_C)
         v_c = -(qb * qb * v_A + qb * qc * v_B + qc * qc * v_C)
-        if ANTIALIASED:
+        if v_compensations is not None:
             ratio, scaling = compensation(det_sharp, det, FLOOR)
             v_scaling = tl.load(v_compensations + row, mask=valid, other=0.0)
             v_ratio = tl.where(ratio >= FLOOR * FLOOR, v_scaling / (2.0 * scaling * det), 0.0)         # over det, as the rest
@@ -281,7 +281,8 @@ def project_bwd_kernel(means, quats, scales, covars, viewmats, Ks, radii, v_mean
         v_u, v_v = load_row(v_means2d + row * 2, valid, 2, 2)
         v_p, v_intrinsics = project_point_backward(p, intrinsics, width, height, v_u, v_v, transform(W, v_M0), transform(W, v_M1), MODEL,
                                                    MARGIN)
-        v_p = (v_p[0], v_p[1], v_p[2] + tl.load(v_depths + row, mask=valid, other=0.0))
+        if v_depths is not None:
+            v_p = (v_p[0], v_p[1], v_p[2] + tl.load(v_depths + row, mask=valid, other=0.0))
         v_mean = combine(1.0, v_mean, 1.0, transform_transposed(W, v_p))
         if partials is not None:
             v_W = (combine(J0[0], v_M0, J1[0], v_M1), combine(J0[1], v_M0, J1[1], v_M1), combine(J0[2], v_M0, J1[2], v_M1))
@@ -318,7 +319,7 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
 
 def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, viewmats: Tensor, Ks: Tensor,
                      width: int, height: int, model: str, eps2d: float, antialiased: bool, radii: Tensor, v_means2d: Tensor,
-                     v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor, cameras: bool = True
+                     v_depths: Tensor | None, v_conics: Tensor, v_compensations: Tensor | None, cameras: bool = True
                      ) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor | None, Tensor, Tensor]:
     """Launcher; see `tsplat_reference.project_backward`."""
     C, N = len(viewmats), len(means)
@@ -332,9 +333,9 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
         programs = ceil_div(N, options["BLOCK"])
         partials = means.new_empty(programs, C, SUMS) if cameras else None
         project_bwd_kernel[(programs,)](
-            means, quats, scales, covars, viewmats, Ks, radii.contiguous(), v_means2d.contiguous(), v_depths.contiguous(),
-            v_conics.contiguous(), v_compensations.contiguous(), v_means, v_quats, v_scales, v_covars, partials, N, C, width, height,
-            eps2d, MODEL=model, ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, LARGEST=LARGEST, SUMS=SUMS,
+            means, quats, scales, covars, viewmats, Ks, radii.contiguous(), v_means2d.contiguous(), _contiguous(v_depths),
+            v_conics.contiguous(), _contiguous(v_compensations if antialiased else None), v_means, v_quats, v_scales, v_covars, partials, N,
+            C, width, height, eps2d, MODEL=model, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, LARGEST=LARGEST, SUMS=SUMS,
             **options, enable_fp_fusion=True)
         if partials is not None:
             sums = partials.sum(0)                      # [C, SUMS]

@@ -158,14 +158,14 @@ def _looped(op: Callable[..., Any]) -> Callable[..., tuple[Any, Any]]:
     return rule
 
 
-def second_derivative(function: Callable[..., Sequence[Tensor]], inputs: Sequence[Tensor | None], cotangents: Sequence[Tensor],
+def second_derivative(function: Callable[..., Sequence[Tensor]], inputs: Sequence[Tensor | None], cotangents: Sequence[Tensor | None],
                       v_gradients: Sequence[Tensor | None]) -> tuple[list[Tensor | None], list[Tensor | None]]:
     """Backward of a backward op, by autograd through the reference, on any device.
 
     Args:
         function: the differentiable reference of the forward op, from `inputs` to its floating-point outputs.
         inputs: differentiable inputs of the forward op, None where absent.
-        cotangents: gradients of the outputs that the backward op was given.
+        cotangents: gradients of the outputs that the backward op was given, None for zeros.
         v_gradients: gradients of the backward op's results, one for each input, None where there is none.
 
     Returns:
@@ -173,14 +173,14 @@ def second_derivative(function: Callable[..., Sequence[Tensor]], inputs: Sequenc
     """
     with torch.enable_grad():
         leaves = [None if x is None else x.detach().requires_grad_() for x in inputs]
-        ups = [v.detach().requires_grad_() for v in cotangents]
-        present = [x for x in leaves if x is not None]
-        outputs = [(o, v) for o, v in zip(function(*leaves), ups, strict=True) if o.requires_grad]
+        ups = [None if v is None else v.detach().requires_grad_() for v in cotangents]
+        present, given = ([x for x in some if x is not None] for some in (leaves, ups))
+        outputs = [(o, v) for o, v in zip(function(*leaves), ups, strict=True) if v is not None and o.requires_grad]
         gradients = iter(torch.autograd.grad([o for o, _ in outputs], present, [v for _, v in outputs], create_graph=True,
                                              materialize_grads=True))
         pairs = [(g, v) for g, v in ((next(gradients), v) for x, v in zip(leaves, v_gradients, strict=True) if x is not None)
                  if v is not None and g.requires_grad]
         if not pairs:
             return [None] * len(inputs), [None] * len(ups)
-        found = iter(torch.autograd.grad([g for g, _ in pairs], [*present, *ups], [v for _, v in pairs], allow_unused=True))
-    return [None if x is None else next(found) for x in leaves], list(found)
+        found = iter(torch.autograd.grad([g for g, _ in pairs], [*present, *given], [v for _, v in pairs], allow_unused=True))
+    return [None if x is None else next(found) for x in leaves], [None if v is None else next(found) for v in ups]

@@ -33,8 +33,8 @@ def _project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars:
 
 def _project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
                       viewmats: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float,
-                      antialiased: bool, radii: Tensor, v_means2d: Tensor, v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor,
-                      cameras: bool = True) -> Six:
+                      antialiased: bool, radii: Tensor, v_means2d: Tensor, v_depths: Tensor | None, v_conics: Tensor,
+                      v_compensations: Tensor | None, cameras: bool = True) -> Six:
     """Gradients of means, quats, scales, covars, viewmats and Ks, empty for those that are None, and without `cameras` for the last two."""
     return _some_empty(means, run_kernel(
         "projection", "project_backward", means, means, quats, scales, covars, viewmats, Ks, width, height, model, eps2d, antialiased,
@@ -67,8 +67,8 @@ def _project_fake(means: Tensor, quats: Any, scales: Any, covars: Any, opacities
 
 def _project_backward_fake(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
                            viewmats: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float,
-                           antialiased: bool, radii: Tensor, v_means2d: Tensor, v_depths: Tensor, v_conics: Tensor,
-                           v_compensations: Tensor, cameras: bool = True) -> Six:
+                           antialiased: bool, radii: Tensor, v_means2d: Tensor, v_depths: Tensor | None, v_conics: Tensor,
+                           v_compensations: Tensor | None, cameras: bool = True) -> Six:
     inputs = means, quats, scales, covars, *((viewmats, Ks) if cameras else (viewmats[:0], Ks[:0]))
     return tuple(means.new_empty(0 if x is None else x.shape) for x in inputs)  # type: ignore[return-value]
 
@@ -76,14 +76,20 @@ def _project_backward_fake(means: Tensor, quats: Tensor | None, scales: Tensor |
 def _save(ctx: Any, inputs: tuple[Any, ...], output: Five) -> None:
     tensors, ctx.options = inputs[:7], inputs[7:]
     ctx.mark_non_differentiable(output[0])
-    ctx.set_materialize_grads(True)
+    ctx.set_materialize_grads(False)                    # depths and compensations seldom have one, and zeros would be written and read
     ctx.save_for_backward(*tensors, output[0])
 
 
-def _backward(ctx: Any, _: Any, *gradients: Tensor) -> tuple[Any, ...]:
+def _backward(ctx: Any, _: Any, *gradients: Tensor | None) -> tuple[Any, ...]:
     *tensors, radii = ctx.saved_tensors
+    if all(v is None for v in gradients):
+        return (None,) * 14
+    v_means2d, v_depths, v_conics, v_compensations = (None if v is None else v.contiguous() for v in gradients)
+    shape, means = radii.shape[:2], tensors[0]
+    v_means2d = means.new_zeros(*shape, 2) if v_means2d is None else v_means2d
+    v_conics = means.new_zeros(*shape, 3) if v_conics is None else v_conics
     cameras = any(ctx.needs_input_grad[5:7])            # seldom wanted, and 8 more operations of torch
-    results = project_backward_op(*tensors, *ctx.options, radii, *(v.contiguous() for v in gradients), cameras)
+    results = project_backward_op(*tensors, *ctx.options, radii, v_means2d, v_depths, v_conics, v_compensations, cameras)
     v_shapes = (None if x is None else r for x, r in zip(tensors[:4], results, strict=False))
     return *v_shapes, None, *(results[4:] if cameras else (None, None)), *[None] * 7
 

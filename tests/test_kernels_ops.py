@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,7 +17,9 @@ from torch.library import opcheck
 
 import tsplat
 
-pytest.importorskip("triton", reason="Triton is not installed here")
+triton = pytest.importorskip("triton", reason="Triton is not installed here")
+
+from tsplat.kernels import launch  # noqa: E402
 
 OPS = [getattr(importlib.import_module(f"tsplat.ops.{module}"), name) for module, name in (
     ("projection", "project_op"), ("projection", "project_backward_op"), ("harmonics", "harmonics_op"),
@@ -104,9 +107,9 @@ def test_opcheck_of_every_op() -> None:
     with kernels():
         with record(calls):
             values_and_gradients(render, leaves)
-        assert set(calls) == {op._qualname for op in OPS}
+        assert set(calls) == {op.custom._qualname for op in OPS}
         for op in OPS:
-            opcheck(op, calls[op._qualname], test_utils=("test_schema", "test_faketensor"))
+            opcheck(op.custom, calls[op.custom._qualname], test_utils=("test_schema", "test_faketensor"))
 
 
 @contextlib.contextmanager
@@ -143,3 +146,78 @@ def test_a_cpu_tensor_never_touches_triton(monkeypatch: pytest.MonkeyPatch) -> N
     for module in ("projection", "harmonics", "binning", "blending"):
         monkeypatch.setattr(importlib.import_module(f"tsplat.ops.{module}"), "run_kernel", fail)
     render(*inputs(device="cpu"))
+
+
+class Compiler:
+    """Stands for a JIT function, for its binaries, and for the driver; keeps who launched what."""
+
+    arg_names = "x", "y", "N", "eps", "D"
+    function, packed_metadata = "function", "metadata"
+
+    def __init__(self) -> None:
+        self.launches: list[tuple[str, tuple[Any, ...]]] = []
+        self.params = [SimpleNamespace(name=n, do_not_specialize=n == "N", annotation_type="fp64" if n == "eps" else "", is_constexpr=n == "D")
+                       for n in self.arg_names]
+
+    def __getitem__(self, grid: tuple[int, ...]) -> Callable[..., Compiler]:
+        def launch(*args: Any, **constants: Any) -> Compiler:
+            self.launches.append(("triton", args))
+            return self
+        return launch
+
+    def run(self, *args: Any) -> None:
+        """As that of a binary."""
+        self.launches.append(("binary", args))
+
+    def get_current_device(self) -> int:
+        return 0
+
+    def get_current_stream(self, device: int) -> str:
+        return "stream"
+
+    def get_current_target(self) -> Any:
+        return SimpleNamespace(backend="cuda", warp_size=32)
+
+
+@pytest.fixture
+def compiler(monkeypatch: pytest.MonkeyPatch) -> Compiler:
+    """Kernels as on a GPU."""
+    stand_in = Compiler()
+    monkeypatch.setattr(launch, "INTERPRETED", False)
+    monkeypatch.setattr(launch, "CompiledKernel", Compiler)
+    monkeypatch.setattr(triton.runtime, "driver", SimpleNamespace(active=stand_in))
+    return stand_in
+
+
+def test_a_second_launch_goes_to_the_binary_of_the_first(compiler: Compiler) -> None:
+    kernel, x, other = launch.Launcher(compiler), torch.zeros(8), torch.ones(3, 5)
+    kernel[(3,)](x, None, 7, 0.5, D=4, num_warps=2)
+    kernel[(5,)](other, None, 9, 1, D=4, num_warps=2)
+    kernel[(5,)](other, None, 9, 0.25, D=4, num_warps=2)
+    assert [who for who, _ in compiler.launches] == ["triton", "triton", "binary"]       # an int for a float is another key
+    assert compiler.launches[2][1] == (5, 1, 1, "stream", "function", "metadata", None, None, None, other, None, 9, 0.25, 4)
+
+
+@pytest.mark.parametrize("change", [{"x": torch.zeros(8, dtype=torch.float64)}, {"x": torch.zeros(8)[1:]}, {"y": torch.zeros(8)}, {"N": 2**31},
+                                    {"D": 3}, {"num_warps": 4}], ids=str)
+def test_what_a_binary_is_compiled_for_is_not_mistaken(compiler: Compiler, change: dict[str, Any]) -> None:
+    kernel = launch.Launcher(compiler)
+    for options in ({}, change, {}, change):
+        a = {"x": torch.zeros(8), "y": None, "N": 7, "eps": 0.5, "D": 4, "num_warps": 2} | options
+        kernel[(3, 2)](a["x"], a["y"], a["N"], a["eps"], D=a["D"], num_warps=a["num_warps"])
+    assert [who for who, _ in compiler.launches] == ["triton", "triton", "binary", "binary"]
+
+
+def test_launches_that_triton_must_see_go_to_it(compiler: Compiler, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Integers whose value it looks at, profilers, and other GPUs than NVIDIA's."""
+    kernel, x = launch.Launcher(compiler), torch.zeros(8)
+    for _ in range(2):
+        kernel[(3,)](x, 5, 7, 0.5, D=4)
+    kernel[(3,)](x, x, 7, 0.5, D=4)
+    with monkeypatch.context() as patch:
+        patch.setattr(triton.knobs.runtime, "launch_enter_hook", lambda _: None)
+        kernel[(3,)](x, x, 7, 0.5, D=4)
+    monkeypatch.setattr(launch, "current_target", lambda: launch.Target(64, False))
+    for _ in range(2):
+        kernel[(3,)](x, x, 7, 0.5, D=5)
+    assert [who for who, _ in compiler.launches] == ["triton"] * 6

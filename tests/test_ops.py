@@ -22,6 +22,7 @@ from torch.autograd import forward_ad, gradcheck, gradgradcheck
 from torch.fx.experimental.symbolic_shapes import ShapeEnv
 from torch.library import opcheck
 from torch.testing._internal.optests import aot_autograd_check
+from torch.utils._python_dispatch import TorchDispatchMode
 
 import tsplat
 from tsplat import Camera, ops
@@ -62,15 +63,17 @@ def blend_arguments(n: int = 6, background: bool = True, absgrad: bool = True, s
             torch.zeros_like(s.means2d) if absgrad else None, *bins, WIDTH, HEIGHT, TILE, 0.99)
 
 
-def project_backward_arguments(antialiased: bool = True, covars: bool = False, n: int = 6) -> tuple[Any, ...]:
+def project_backward_arguments(antialiased: bool = True, covars: bool = False, n: int = 6, cameras: bool = True, sparse: bool = False
+                               ) -> tuple[Any, ...]:
     args = project_arguments(antialiased, covars, n)
     radii, *outputs = reference.project(*args)
-    return *args, radii, *(torch.randn_like(x) for x in outputs)
+    v_means2d, v_depths, v_conics, v_compensations = (torch.randn_like(x) for x in outputs)
+    return *args, radii, v_means2d, None if sparse else v_depths, v_conics, None if sparse else v_compensations, cameras
 
 
-def harmonics_backward_arguments(degree: int = 2, n: int = 6) -> tuple[Any, ...]:
+def harmonics_backward_arguments(degree: int = 2, n: int = 6, cameras: bool = True) -> tuple[Any, ...]:
     args = harmonics_arguments(degree, n)
-    return *args, torch.randn_like(reference.harmonics(*args))
+    return *args, torch.randn_like(reference.harmonics(*args)), cameras
 
 
 def blend_backward_arguments(n: int = 6, background: bool = True, absgrad: bool = True,
@@ -88,12 +91,15 @@ CASES: dict[str, tuple[Any, Callable[..., tuple[Any, ...]], dict[str, Any]]] = {
     "project_backward, covars": (projection.project_backward_op, project_backward_arguments,
                                  {"covars": True, "antialiased": False}),
     "project_backward, N = 0": (projection.project_backward_op, project_backward_arguments, {"n": 0}),
+    "project_backward, fixed cameras": (projection.project_backward_op, project_backward_arguments, {"cameras": False}),
+    "project_backward, sparse": (projection.project_backward_op, project_backward_arguments, {"sparse": True}),
     "harmonics": (harmonics.harmonics_op, harmonics_arguments, {}),
     "harmonics, degree 0": (harmonics.harmonics_op, harmonics_arguments, {"degree": 0}),
     "harmonics, N = 0": (harmonics.harmonics_op, harmonics_arguments, {"n": 0}),
     "harmonics_backward": (harmonics.harmonics_backward_op, harmonics_backward_arguments, {}),
     "harmonics_backward, degree 0": (harmonics.harmonics_backward_op, harmonics_backward_arguments, {"degree": 0}),
     "harmonics_backward, N = 0": (harmonics.harmonics_backward_op, harmonics_backward_arguments, {"n": 0}),
+    "harmonics_backward, fixed cameras": (harmonics.harmonics_backward_op, harmonics_backward_arguments, {"cameras": False}),
     "bin_splats": (binning.bin_splats_op, bin_arguments, {}),
     "bin_splats, N = 0": (binning.bin_splats_op, bin_arguments, {"n": 0}),
     "blend": (blending.blend_op, blend_arguments, {}),
@@ -129,7 +135,7 @@ def test_opcheck(backend: Backend, name: str) -> None:
     if name in FORWARD:
         args = require_grad(args)
     checks = ["test_schema", "test_autograd_registration", "test_faketensor"]
-    opcheck(op, args, test_utils=checks)
+    opcheck(op.custom, args, test_utils=checks)
 
     def floating(*args: Any) -> list[Tensor]:  # opcheck's own version of this fails if an int comes first
         results = op(*args)
@@ -234,6 +240,21 @@ def test_expanded_upstream_gradients(backend: Backend, name: str) -> None:
     assert_same_bits(torch.autograd.grad(sum(o.sum() for o in outputs), inputs), dense)
 
 
+@pytest.mark.parametrize("which", range(1, 5))
+def test_upstream_gradients_that_are_absent_are_zeros(backend: Backend, which: int) -> None:
+    """Of one output of the projection at a time; the first derivative and the second."""
+    _, args = case("project", backend)
+    args = require_grad(args, (4,))
+    inputs = [a for a in args if isinstance(a, Tensor) and a.requires_grad]
+    found = []
+    for zeros in (False, True):
+        outputs = ops.project(*args)
+        loss = sum((x.square().sum() * (i == which) for i, x in enumerate(outputs) if i > 0 and (zeros or i == which)), torch.zeros(()))
+        v = torch.autograd.grad(loss, inputs, create_graph=True)
+        found.append([*v, *torch.autograd.grad(sum(x.square().sum() for x in v), inputs)])
+    assert_close(*found, 1e-14)
+
+
 def test_the_order_of_splats_has_no_gradient_and_needs_none(backend: Backend) -> None:
     _, args = case("bin_splats", backend)
     assert not any(x.requires_grad for x in ops.bin_splats(*require_grad(args)))
@@ -301,6 +322,93 @@ def test_the_renderer_is_differentiable_twice_with_every_option(backend: Backend
         return [r.image, r.alpha, *([r.depth] if option == "depth" else [])]
 
     assert gradgradcheck(call, inputs, fast_mode=True)
+
+
+def test_fixed_cameras_change_no_other_gradient(backend: Backend) -> None:
+    """Neither the first nor the second derivative."""
+    args = render_arguments(backend)
+    fixed = [x.detach() if i in (5, 6) else x for i, x in enumerate(args)]
+    moving, others = (inputs[:5] + inputs[7:] for inputs in (args, fixed))
+    first = [torch.autograd.grad([x.square().sum() for x in render(*inputs)], leaves_, create_graph=True)
+             for inputs, leaves_ in ((args, moving), (fixed, others))]
+    assert_same_bits(*first)
+    assert_close(*([*torch.autograd.grad([g.square().sum() for g in v], leaves_)] for v, leaves_ in zip(first, (moving, others), strict=True)),
+                 1e-12)
+
+
+# The two forms of an op
+
+EVERY_OP = list({id(op): op for op, _, _ in CASES.values()}.values())
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if not name.startswith("bin")])
+def test_both_forms_agree(backend: Backend, name: str) -> None:
+    """In results, gradients and, from the forward ops, second derivatives."""
+    op, args = case(name, backend)
+    args = require_grad(args, (5,) if name.startswith("blend,") or name == "blend" else ())       # absgrad has no second derivative
+    inputs = [a for a in args if isinstance(a, Tensor) and a.requires_grad]
+    found = []
+    for form in (op, op.custom):
+        results = form(*args)
+        results = [results] if isinstance(results, Tensor) else list(results)
+        loss = sum(r.square().sum() for r in results[:5] if r.requires_grad)
+        v = torch.autograd.grad(loss, inputs, create_graph=name in FORWARD, materialize_grads=True)
+        if name in DIFFERENTIABLE:
+            v += torch.autograd.grad(sum(x.square().sum() for x in v), inputs, materialize_grads=True)
+        found.append([*results, *v])
+    assert_same_bits(*found)
+
+
+class Dispatched(Exception):
+    """A call came to the custom op."""
+
+
+@pytest.fixture
+def no_dispatcher(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: Any) -> None:
+        raise Dispatched
+
+    for op in EVERY_OP:
+        monkeypatch.setattr(op, "custom", refuse)
+
+
+@pytest.mark.usefixtures("no_dispatcher")
+def test_eager_calls_and_their_gradients_go_past_the_dispatcher(backend: Backend) -> None:
+    args = render_arguments(backend)
+    v = torch.autograd.grad(sum(x.square().sum() for x in render(*args)), args, create_graph=True)
+    torch.autograd.grad(sum(x.square().sum() for x in v), args)
+    with torch.no_grad():
+        render(*args)
+    with torch.inference_mode():
+        render(*args)
+    render(*(torch.nn.Parameter(x.detach()) for x in args))
+
+
+class Subclass(Tensor):
+    """Some tensor of another kind."""
+
+
+class Mode(TorchDispatchMode):
+    """Looks on."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: tuple[Any, ...] = (), kwargs: dict[str, Any] | None = None) -> Any:
+        return func(*args, **(kwargs or {}))
+
+
+@pytest.mark.usefixtures("no_dispatcher")
+@pytest.mark.parametrize("name", CASES)
+def test_whoever_looks_on_sees_the_custom_op(backend: Backend, name: str) -> None:
+    op, args = case(name, backend)
+    with pytest.raises(Dispatched), torch.autocast(backend.device.type, torch.bfloat16):
+        op(*args)
+    with pytest.raises(Dispatched), Mode():
+        op(*args)
+    with pytest.raises(Dispatched):
+        op(args[0].as_subclass(Subclass), *args[1:])
+    with pytest.raises(Dispatched):
+        op(*each(lambda x: x.to("meta"), args))
+    with pytest.raises(Dispatched):
+        torch.func.vmap(lambda x: op(x, *args[1:]))(args[0][None])
 
 
 # Compilers

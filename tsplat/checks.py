@@ -8,6 +8,10 @@ from types import EllipsisType
 import torch
 from torch import Tensor
 
+NUMBERS = (int, float, torch.SymInt, torch.SymFloat)
+SIZES = (int, torch.SymInt)
+"""Tuples, which isinstance takes in 0.1 us; to make a union, as in `int | float`, takes 1 each time."""
+
 
 def _shape_text(shape: Sequence[int | str | EllipsisType]) -> str:
     return "[" + ", ".join("..." if s is ... else str(s) for s in shape) + "]"
@@ -25,6 +29,9 @@ def check_tensor(name: str, value: object, shape: Sequence[int | str | EllipsisT
 
     `like` is another tensor that must have the same dtype and device.
     """
+    if (like is not None and isinstance(value, Tensor) and value.shape == shape and value.dtype == like.dtype
+            and value.device == like.device and like.is_floating_point()):
+        return                                          # most are right: 1 us instead of 2, 6 times in a call of rasterize
     if not isinstance(value, Tensor):
         raise TypeError(f"{name}: expected a torch.Tensor of shape {_shape_text(shape)}; got {type(value).__name__}")
     if not value.is_floating_point():
@@ -39,13 +46,13 @@ def check_tensor(name: str, value: object, shape: Sequence[int | str | EllipsisT
 
 def check_number(name: str, value: object, expected: str) -> None:
     """Check that `value` is an int or a float; `expected` says which."""
-    if not isinstance(value, int | float | torch.SymInt | torch.SymFloat) or isinstance(value, bool):
+    if not isinstance(value, NUMBERS) or isinstance(value, bool):
         raise TypeError(f"{name}: expected {expected}; got {value!r}")
 
 
 def check_size(name: str, value: object) -> None:
     """Check that `value` is an int of at least 1."""
-    if not isinstance(value, int | torch.SymInt) or isinstance(value, bool):
+    if not isinstance(value, SIZES) or isinstance(value, bool):
         raise TypeError(f"{name}: expected an int of at least 1; got {value!r}")
     if value < 1:
         raise ValueError(f"{name}: expected at least 1; got {value}")

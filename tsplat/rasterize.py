@@ -95,14 +95,15 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
     _check(means, quats, scales, opacities, colors, camera, sh_degree, covars, background, depth, eps2d, alpha_max, screen_offset, absgrad,
            tile)
     C, width, height = len(camera), camera.width, camera.height
-    viewmats, Ks = camera.viewmats.reshape(-1, 4, 4), camera.Ks.reshape(-1, 3, 3)
+    viewmats, Ks = (camera.viewmats, camera.Ks) if camera.batched else (camera.viewmats[None], camera.Ks[None])
     radii, means2d, depths, conics, compensations = ops.project(
         means, quats, scales, covars, opacities, viewmats, Ks, width, height, camera.model, camera.near, camera.far, eps2d, antialiased)
     if screen_offset is not None:
         means2d = means2d + screen_offset
-    view_opacities = opacities * compensations if antialiased else opacities.expand(C, -1)
+    # not expand for one camera: its gradient is a sum, a kernel
+    view_opacities = opacities * compensations if antialiased else opacities[None] if C == 1 else opacities.expand(C, -1)
 
-    visible = (radii > 0).all(-1)
+    visible = radii[..., 0] > 0                         # both are 0 of a splat that is culled
     if sh_degree is not None:
         view_colors = (ops.harmonics(means, camera_centers(viewmats), colors, sh_degree, visible) + 0.5).clamp_min(0.0)
     else:
@@ -111,7 +112,8 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
     if depth is not None:
         view_colors = torch.cat([view_colors.expand(C, -1, -1), depths[..., None]], -1)
         backgrounds = None if backgrounds is None else torch.nn.functional.pad(backgrounds, (0, 1))
-    radii = torch.where((visible & view_colors.isfinite().all(-1))[..., None], radii, 0)
+    finite = view_colors.detach().abs().amax(-1) < float("inf")             # 3 kernels where isfinite().all(-1) has 5
+    radii = radii * (visible & finite)[..., None]
 
     bins = ops.bin_splats(means2d, radii, conics, view_opacities, depths, width, height, tile)
     image, alpha = ops.blend(means2d, conics, view_opacities, view_colors, backgrounds, absgrad, bins.ids, bins.offsets, width, height,
@@ -123,7 +125,8 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
     meta = Meta(radii, means2d, depths, bins.offsets.diff().view(C, *reversed(tile_counts(width, height, tile))))
     if camera.batched:
         return Rendering(image, alpha, z, meta)
-    return Rendering(image[0], alpha[0], None if z is None else z[0], meta)
+    # not image[0], of which the gradient is a zeroed and a copied image
+    return Rendering(image.squeeze(0), alpha.squeeze(0), None if z is None else z.squeeze(0), meta)
 
 
 def _check(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, colors: Tensor, camera: Camera,

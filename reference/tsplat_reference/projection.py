@@ -112,7 +112,7 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
 
 
 class ProjectionGradients(NamedTuple):
-    """Gradients of the arguments of `project`, None where the argument is None."""
+    """Gradients of the arguments of `project`, None where the argument is None; `[0, 4, 4]` and `[0, 3, 3]` of cameras if not asked for."""
 
     means: Tensor
     quats: Tensor | None
@@ -124,12 +124,14 @@ class ProjectionGradients(NamedTuple):
 
 def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, viewmats: Tensor, Ks: Tensor,
                      width: int, height: int, model: str, eps2d: float, antialiased: bool, radii: Tensor, v_means2d: Tensor,
-                     v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor) -> ProjectionGradients:
-    """Closed-form gradients of `project`, of which `radii` says what was culled."""
+                     v_depths: Tensor | None, v_conics: Tensor, v_compensations: Tensor | None, cameras: bool = True
+                     ) -> ProjectionGradients:
+    """Closed-form gradients of `project`, of which `radii` says what was culled; those of viewmats and Ks if `cameras`. None is zeros."""
     if means.shape[0] > CHUNK:
         parts = map_chunks(lambda rows: project_backward(
             means[rows], _at(quats, rows), _at(scales, rows), _at(covars, rows), viewmats, Ks, width, height, model, eps2d, antialiased,
-            radii[:, rows], v_means2d[:, rows], v_depths[:, rows], v_conics[:, rows], v_compensations[:, rows]), means.shape[0], CHUNK)
+            radii[:, rows], v_means2d[:, rows], None if v_depths is None else v_depths[:, rows], v_conics[:, rows],
+            None if v_compensations is None else v_compensations[:, rows], cameras), means.shape[0], CHUNK)
         return ProjectionGradients(torch.cat([p.means for p in parts]), _cat([p.quats for p in parts]), _cat([p.scales for p in parts]),
                                    _cat([p.covars for p in parts]), torch.stack([p.viewmats for p in parts]).sum(0),
                                    torch.stack([p.Ks for p in parts]).sum(0))
@@ -150,7 +152,7 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
     inverse = 1 / det
     v_det = (v_B * b - v_A * c - v_C * a) * inverse * inverse
     v_a, v_b, v_c = v_C * inverse + v_det * c, -v_B * inverse - 2 * v_det * b, v_A * inverse + v_det * a
-    if antialiased:
+    if antialiased and v_compensations is not None:
         ratio = (a0 * c0 - b * b) * inverse
         root = ratio.clamp_min(COMPENSATION_MIN**2).sqrt()
         v_ratio = torch.where(valid & (ratio >= COMPENSATION_MIN**2), v_compensations / (2 * root), 0.0) * inverse
@@ -163,11 +165,11 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
     v_W = matmul(transpose(J), v_M)
     v_u, v_v = (torch.where(valid, v, 0.0) for v in v_means2d.unbind(-1))
     v_p, v_Ks = project_points_backward(p, intrinsics, width, height, model, v_u, v_v, matmul(v_M, transpose(W)))
-    v_x, v_y, v_z = (torch.where(valid, v, 0.0) for v in (*v_p[:2], v_p[2] + v_depths))
+    v_x, v_y, v_z = (torch.where(valid, v, 0.0) for v in (*v_p[:2], v_p[2] if v_depths is None else v_p[2] + v_depths))
 
     # p = W mean + t
-    v_viewmats = torch.zeros_like(viewmats)
-    for i, v in enumerate((v_x, v_y, v_z)):
+    v_viewmats, v_Ks = (torch.zeros_like(viewmats), v_Ks) if cameras else (viewmats.new_empty(0, 4, 4), Ks.new_empty(0, 3, 3))
+    for i, v in enumerate((v_x, v_y, v_z) if cameras else ()):
         for j in range(3):
             v_viewmats[:, i, j] = total(v_W[i][j], det) + v @ means[:, j]
         v_viewmats[:, i, 3] = v.sum(1)

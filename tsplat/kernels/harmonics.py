@@ -14,7 +14,7 @@ import triton.language as tl
 from torch import Tensor
 
 from tsplat.kernels.camera import dot, load_row, stack, store_row
-from tsplat.kernels.launch import ceil_div, launch, on_device_of
+from tsplat.kernels.launch import Launcher, ceil_div, launch
 
 HELD = 50
 """Coefficients that a thread holds at the most if there are more than 3 channels; from 64 on, some targets run out of registers."""
@@ -165,6 +165,7 @@ def load_coefficients(p, wanted, USED: tl.constexpr, D: tl.constexpr, CHANNELS: 
         return v
 
 
+@Launcher
 @triton.jit(do_not_specialize=["N", "C"])
 def harmonics_fwd_kernel(means, centers, coeffs, mask, out, N, C, K: tl.constexpr, D: tl.constexpr, DEGREE: tl.constexpr,
                          CHANNELS: tl.constexpr, CHUNK: tl.constexpr, BLOCK: tl.constexpr):
@@ -189,12 +190,13 @@ def harmonics_fwd_kernel(means, centers, coeffs, mask, out, N, C, K: tl.constexp
         camera += 1
 
 
+@Launcher
 @triton.jit(do_not_specialize=["N", "C"])
 def harmonics_bwd_kernel(means, centers, coeffs, mask, v_out, v_means, v_coeffs, partial_centers, N, C, K: tl.constexpr, D: tl.constexpr,
                          DEGREE: tl.constexpr, CHANNELS: tl.constexpr, CHUNK: tl.constexpr, BLOCK: tl.constexpr):
     """Gradients of one block of splats and one group of channels: v_coeffs; v_means `[groups, N, 3]`; -v_centers, summed over the block.
 
-    These sums `[groups x programs, C, 4]`, and the groups, torch adds up: no atomics, the same bits in every run.
+    These sums `[groups x programs, C, 4]`, if there are such, and the groups, torch adds up: no atomics, the same bits in every run.
     """
     USED: tl.constexpr = (DEGREE + 1) * (DEGREE + 1)
     COUNT: tl.constexpr = USED * CHANNELS
@@ -234,9 +236,10 @@ def harmonics_bwd_kernel(means, centers, coeffs, mask, v_out, v_means, v_coeffs,
             v_y = tl.where(some, (v_unit[1] - unit[1] * along) * inverse, 0.0)
             v_z = tl.where(some, (v_unit[2] - unit[2] * along) * inverse, 0.0)
             v_mean = (v_mean[0] + v_x, v_mean[1] + v_y, v_mean[2] + v_z)
-            total = tl.sum(stack((v_x, v_y, v_z, zero), 4), 0)
-            row = (tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)).to(tl.int64) * C + camera
-            tl.store(partial_centers + row * 4 + tl.arange(0, 4), total)
+            if partial_centers is not None:
+                total = tl.sum(stack((v_x, v_y, v_z, zero), 4), 0)
+                row = (tl.program_id(1) * tl.num_programs(0) + tl.program_id(0)).to(tl.int64) * C + camera
+                tl.store(partial_centers + row * 4 + tl.arange(0, 4), total)
         camera += 1
     v_rows = coefficient_rows(v_coeffs, n, K, D, CHANNELS)
     if CHANNELS == D:
@@ -257,33 +260,33 @@ def harmonics(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask:
         return out
     options = launch("harmonics")
     channels, chunk = _group(K, D, degree)
-    with on_device_of(means):
-        harmonics_fwd_kernel[(ceil_div(N, options["BLOCK"]), D // channels)](
-            means.contiguous(), centers.contiguous(), coeffs.contiguous(), mask.contiguous(), out, N, C, K=K, D=D, DEGREE=degree,
-            CHANNELS=channels, CHUNK=chunk, **options, enable_fp_fusion=True)
+    harmonics_fwd_kernel[(ceil_div(N, options["BLOCK"]), D // channels)](
+        means.contiguous(), centers.contiguous(), coeffs.contiguous(), mask.contiguous(), out, N, C, K=K, D=D, DEGREE=degree,
+        CHANNELS=channels, CHUNK=chunk, **options, enable_fp_fusion=True)
     return out
 
 
-def harmonics_backward(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor, v_out: Tensor
+def harmonics_backward(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor, v_out: Tensor, cameras: bool = True
                        ) -> tuple[Tensor, Tensor, Tensor]:
-    """Launcher; see `tsplat_reference.harmonics_backward`."""
+    """Launcher; see `tsplat_reference.harmonics_backward`. Without `cameras` there is no gradient of centers: `[0, 3]`."""
     (C, N), (K, D) = mask.shape, coeffs.shape[1:]
     means, centers, coeffs = means.contiguous(), centers.contiguous(), coeffs.contiguous()
+    no_centers = torch.zeros_like(centers) if cameras else centers.new_empty(0, 3)
     if v_out.numel() == 0:
-        return torch.zeros_like(means), torch.zeros_like(centers), torch.zeros_like(coeffs)
+        return torch.zeros_like(means), no_centers, torch.zeros_like(coeffs)
     options = launch("harmonics_backward")
     channels, chunk = _group(K, D, degree)
     programs, groups = ceil_div(N, options["BLOCK"]), D // channels
     v_coeffs = torch.empty_like(coeffs) if (degree + 1) ** 2 == K else torch.zeros_like(coeffs)
     v_means = means.new_empty(groups, N, 3)
-    partial_centers = means.new_empty(groups * programs, C, 4)
-    with on_device_of(means):
-        harmonics_bwd_kernel[(programs, groups)](
-            means, centers, coeffs, mask.contiguous(), v_out.contiguous(), v_means, v_coeffs, partial_centers, N, C, K=K, D=D,
-            DEGREE=degree, CHANNELS=channels, CHUNK=chunk, **options, enable_fp_fusion=True)
+    partial_centers = means.new_empty(groups * programs, C, 4) if cameras else None
+    harmonics_bwd_kernel[(programs, groups)](
+        means, centers, coeffs, mask.contiguous(), v_out.contiguous(), v_means, v_coeffs, partial_centers, N, C, K=K, D=D,
+        DEGREE=degree, CHANNELS=channels, CHUNK=chunk, **options, enable_fp_fusion=True)
     if degree == 0:
-        return torch.zeros_like(means), torch.zeros_like(centers), v_coeffs
-    return v_means[0] if groups == 1 else v_means.sum(0), -partial_centers.sum(0)[:, :3], v_coeffs
+        return torch.zeros_like(means), no_centers, v_coeffs
+    v_centers = no_centers if partial_centers is None else -partial_centers.sum(0)[:, :3]
+    return v_means[0] if groups == 1 else v_means.sum(0), v_centers, v_coeffs
 
 
 def _group(K: int, D: int, degree: int) -> tuple[int, int]:

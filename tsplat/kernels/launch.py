@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-import contextlib
+import functools
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
-import torch
 import triton
 from torch import Tensor
+from triton.compiler import CompiledKernel
 
 FAMILIES = ("nvidia", "cdna", "rdna")
 
@@ -25,12 +27,70 @@ class Target:
         return "nvidia" if self.ptx else "cdna" if self.lanes == 64 else "rdna"
 
 
+INTERPRETED = bool(triton.knobs.runtime.interpret)
+"""Whether kernels run in the interpreter: settled, as in `triton.jit`, on import."""
+
+
 def current_target() -> Target:
     """The current device's target; the interpreter counts as a portable one of 32 lanes."""
-    if triton.knobs.runtime.interpret:
+    if INTERPRETED:
         return Target(32, False)
-    target = triton.runtime.driver.active.get_current_target()
+    driver = triton.runtime.driver.active
+    return _target(driver, driver.get_current_device())
+
+
+@functools.cache
+def _target(driver: Any, device: Any) -> Target:
+    """Held, as to ask for a device's properties takes 5 us, and is done some ten times in a forward and backward."""
+    target = driver.get_current_target()
     return Target(target.warp_size, target.backend == "cuda")
+
+
+class Launcher:
+    """A kernel whose launches, `kernel[grid](*arguments, **constants)`, take 4 us of Python instead of 8 to 18.
+
+    `JITFunction.run` makes a text of all that a binary is compiled for, and looks that up. Here the same, as it is, is the key of a binary
+    that an earlier launch returned: dtypes, alignment of pointers, width of integers, constants and the device. It is complete if no
+    integer's value matters (`do_not_specialize`) and constants come last, on NVIDIA (AMD's binaries depend on sizes of tensors, too).
+    Launches of which that is not so, all in the interpreter, those that a profiler has hooked, and where what came back is not what is
+    known (a compiler that does not launch) are Triton's own. Other knobs of Triton that are turned after the first launch do not act.
+    """
+
+    def __init__(self, kernel: Any) -> None:
+        self.kernel = kernel
+        self.binaries: dict[tuple[Any, ...], tuple[Any, ...]] = {}
+
+    def __getitem__(self, grid: tuple[int, ...]) -> Callable[..., None]:
+        return self.kernel[grid] if INTERPRETED else functools.partial(self._launch, grid)
+
+    def _launch(self, grid: tuple[int, ...], *args: Any, **constants: Any) -> None:
+        driver = triton.runtime.driver.active
+        device = driver.get_current_device()
+        kinds = [(a.dtype, a.data_ptr() % 16) if isinstance(a, Tensor) else -2**31 <= a < 2**31 if type(a) is int else type(a) for a in args]
+        key = (device, *kinds, *constants, *constants.values())
+        found = self.binaries.get(key)
+        if found is not None and not _hooked():
+            run, function, metadata, values, _ = found
+            run(*grid, *(1,) * (3 - len(grid)), driver.get_current_stream(device), function, metadata, None, None, None, *args, *values)
+            return
+        binary = self.kernel[grid](*args, **constants)
+        if isinstance(binary, CompiledKernel) and self._known_by_key(args, constants):
+            values = tuple(constants[name] for name in self.kernel.arg_names[len(args):])
+            self.binaries[key] = binary.run, binary.function, binary.packed_metadata, values, binary       # which unloads itself when let go
+
+    def _known_by_key(self, args: tuple[Any, ...], constants: dict[str, Any]) -> bool:
+        """Whether the key has all that a binary is compiled for."""
+        params = self.kernel.params
+        return (current_target().ptx
+                and all(a is None or isinstance(a, Tensor | float) or (type(a) is int and (p.do_not_specialize or p.annotation_type == "fp64"))
+                    for a, p in zip(args, params, strict=False))
+                and all(p.is_constexpr and p.name in constants for p in params[len(args):]))
+
+
+def _hooked() -> bool:
+    """Whether a profiler wants to hear of launches."""
+    runtime = triton.knobs.runtime
+    return any(getattr(hook, "calls", hook) for hook in (runtime.launch_enter_hook, runtime.launch_exit_hook))
 
 
 def ceil_div(a: int, b: int) -> int:
@@ -65,8 +125,3 @@ LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
 def launch(kernel: str) -> dict[str, int]:
     """The constants of a kernel for the current target."""
     return LAUNCHES[kernel][current_target().family]
-
-
-def on_device_of(tensor: Tensor) -> contextlib.AbstractContextManager[object]:
-    """Triton launches on the current device: make it that of the tensor."""
-    return torch.cuda.device(tensor.device) if tensor.is_cuda else contextlib.nullcontext()

@@ -26,7 +26,7 @@ from tsplat.kernels.camera import (
     transform,
     transform_transposed,
 )
-from tsplat.kernels.launch import ceil_div, launch, on_device_of
+from tsplat.kernels.launch import Launcher, ceil_div, launch
 
 SUMS = 16
 """Camera gradients of a block of splats: the rows of W | t, then fx, fy, cx, cy."""
@@ -142,6 +142,7 @@ def half_size(extent, variance):
     return tl.minimum(tl.ceil(extent * tl.sqrt(tl.where(variance < 1e18, variance, 1e18))), 1073741824.0)
 
 
+@Launcher
 @triton.jit(do_not_specialize=["N", "C", "width", "height"])
 def project_fwd_kernel(means, quats, scales, covars, opacities, viewmats, Ks, radii, means2d, depths, conics, compensations, N, C, width,
                        height, near: tl.float64, far: tl.float64, eps2d: tl.float64, MODEL: tl.constexpr, ANTIALIASED: tl.constexpr,
@@ -210,12 +211,13 @@ def add_outer(A, u, v):
     return combine(1.0, A[0], u[0], v), combine(1.0, A[1], u[1], v), combine(1.0, A[2], u[2], v)
 
 
+@Launcher
 @triton.jit(do_not_specialize=["N", "C", "width", "height"])
 def project_bwd_kernel(means, quats, scales, covars, viewmats, Ks, radii, v_means2d, v_depths, v_conics, v_compensations, v_means, v_quats,
-                       v_scales, v_covars, partials, N, C, width, height, eps2d: tl.float64, MODEL: tl.constexpr, ANTIALIASED: tl.constexpr,
-                       MARGIN: tl.constexpr, FLOOR: tl.constexpr, LARGEST: tl.constexpr, SUMS: tl.constexpr, BLOCK: tl.constexpr):
+                       v_scales, v_covars, partials, N, C, width, height, eps2d: tl.float64, MODEL: tl.constexpr, MARGIN: tl.constexpr,
+                       FLOOR: tl.constexpr, LARGEST: tl.constexpr, SUMS: tl.constexpr, BLOCK: tl.constexpr):
     """One block of splats, all cameras in turn: sums over cameras in registers, in a fixed order; sums over the block for each camera to
-    `[programs, C, SUMS]`, which torch adds up. No atomics: the same bits in every run.
+    `[programs, C, SUMS]`, which torch adds up, if there are such. No atomics: the same bits in every run.
 
     Nothing that was culled can do harm: a splat that no camera sees is not read (its shape is 0), the point of a pair that was culled is
     (0, 0, 1), and what comes from above is 0 for it.
@@ -253,7 +255,7 @@ def project_bwd_kernel(means, quats, scales, covars, viewmats, Ks, radii, v_mean
         v_a = -(qa * qa * v_A + qa * qb * v_B + qb * qb * v_C)
         v_b = -(2.0 * qa * qb * v_A + (qa * qc + qb * qb) * v_B + 2.0 * qb * qc * v_C)
         v_c = -(qb * qb * v_A + qb * qc * v_B + qc * qc * v_C)
-        if ANTIALIASED:
+        if v_compensations is not None:
             ratio, scaling = compensation(det_sharp, det, FLOOR)
             v_scaling = tl.load(v_compensations + row, mask=valid, other=0.0)
             v_ratio = tl.where(ratio >= FLOOR * FLOOR, v_scaling / (2.0 * scaling * det), 0.0)         # over det, as the rest
@@ -279,12 +281,14 @@ def project_bwd_kernel(means, quats, scales, covars, viewmats, Ks, radii, v_mean
         v_u, v_v = load_row(v_means2d + row * 2, valid, 2, 2)
         v_p, v_intrinsics = project_point_backward(p, intrinsics, width, height, v_u, v_v, transform(W, v_M0), transform(W, v_M1), MODEL,
                                                    MARGIN)
-        v_p = (v_p[0], v_p[1], v_p[2] + tl.load(v_depths + row, mask=valid, other=0.0))
+        if v_depths is not None:
+            v_p = (v_p[0], v_p[1], v_p[2] + tl.load(v_depths + row, mask=valid, other=0.0))
         v_mean = combine(1.0, v_mean, 1.0, transform_transposed(W, v_p))
-        v_W = (combine(J0[0], v_M0, J1[0], v_M1), combine(J0[1], v_M0, J1[1], v_M1), combine(J0[2], v_M0, J1[2], v_M1))
-        v_W = add_outer(v_W, v_p, mean)
-        sums = tl.sum(stack(v_W[0] + (v_p[0],) + v_W[1] + (v_p[1],) + v_W[2] + (v_p[2],) + v_intrinsics, SUMS), 0)
-        tl.store(partials + (tl.program_id(0).to(tl.int64) * C + camera) * SUMS + tl.arange(0, SUMS), sums)
+        if partials is not None:
+            v_W = (combine(J0[0], v_M0, J1[0], v_M1), combine(J0[1], v_M0, J1[1], v_M1), combine(J0[2], v_M0, J1[2], v_M1))
+            v_W = add_outer(v_W, v_p, mean)
+            sums = tl.sum(stack(v_W[0] + (v_p[0],) + v_W[1] + (v_p[1],) + v_W[2] + (v_p[2],) + v_intrinsics, SUMS), 0)
+            tl.store(partials + (tl.program_id(0).to(tl.int64) * C + camera) * SUMS + tl.arange(0, SUMS), sums)
         camera += 1
 
     store_row(v_means + n * 3, v_mean, inside, 3, 1)
@@ -305,18 +309,17 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
     means2d, depths, conics, compensations = (means.new_empty(C, N, *s) for s in ((2,), (), (3,), ()))
     if C * N > 0:
         options = launch("project")
-        with on_device_of(means):
-            project_fwd_kernel[(ceil_div(N, options["BLOCK"]) * C,)](
-                means.contiguous(), *map(_contiguous, (quats, scales, covars)), opacities.contiguous(), viewmats.contiguous(),
-                Ks.contiguous(), radii, means2d, depths, conics, compensations, N, C, width, height, near, far, eps2d, MODEL=model,
-                ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, ALPHA_MIN=ALPHA_MIN, EXTENT_MAX=EXTENT_MAX,
-                LARGEST=LARGEST, **options, enable_fp_fusion=True)
+        project_fwd_kernel[(ceil_div(N, options["BLOCK"]) * C,)](
+            means.contiguous(), *map(_contiguous, (quats, scales, covars)), opacities.contiguous(), viewmats.contiguous(),
+            Ks.contiguous(), radii, means2d, depths, conics, compensations, N, C, width, height, near, far, eps2d, MODEL=model,
+            ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, ALPHA_MIN=ALPHA_MIN, EXTENT_MAX=EXTENT_MAX,
+            LARGEST=LARGEST, **options, enable_fp_fusion=True)
     return radii, means2d, depths, conics, compensations
 
 
 def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, viewmats: Tensor, Ks: Tensor,
                      width: int, height: int, model: str, eps2d: float, antialiased: bool, radii: Tensor, v_means2d: Tensor,
-                     v_depths: Tensor, v_conics: Tensor, v_compensations: Tensor
+                     v_depths: Tensor | None, v_conics: Tensor, v_compensations: Tensor | None, cameras: bool = True
                      ) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor | None, Tensor, Tensor]:
     """Launcher; see `tsplat_reference.project_backward`."""
     C, N = len(viewmats), len(means)
@@ -324,20 +327,21 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
     quats, scales, covars = map(_contiguous, (quats, scales, covars))
     new = torch.empty_like if C * N > 0 else torch.zeros_like
     v_means, (v_quats, v_scales, v_covars) = new(means), (None if x is None else new(x) for x in (quats, scales, covars))
-    v_viewmats, v_Ks = torch.zeros_like(viewmats), torch.zeros_like(Ks)
+    v_viewmats, v_Ks = (torch.zeros_like(viewmats), torch.zeros_like(Ks)) if cameras else (viewmats.new_empty(0, 4, 4), Ks.new_empty(0, 3, 3))
     if C * N > 0:
         options = launch("project_backward")
-        partials = means.new_empty(ceil_div(N, options["BLOCK"]), C, SUMS)
-        with on_device_of(means):
-            project_bwd_kernel[(len(partials),)](
-                means, quats, scales, covars, viewmats, Ks, radii.contiguous(), v_means2d.contiguous(), v_depths.contiguous(),
-                v_conics.contiguous(), v_compensations.contiguous(), v_means, v_quats, v_scales, v_covars, partials, N, C, width, height,
-                eps2d, MODEL=model, ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, LARGEST=LARGEST, SUMS=SUMS,
-                **options, enable_fp_fusion=True)
-        sums = partials.sum(0)                          # [C, SUMS]
-        v_viewmats[:, :3] = sums[:, :12].view(C, 3, 4)
-        v_Ks.diagonal(0, 1, 2)[:, :2] = sums[:, 12:14]
-        v_Ks[:, :2, 2] = sums[:, 14:]
+        programs = ceil_div(N, options["BLOCK"])
+        partials = means.new_empty(programs, C, SUMS) if cameras else None
+        project_bwd_kernel[(programs,)](
+            means, quats, scales, covars, viewmats, Ks, radii.contiguous(), v_means2d.contiguous(), _contiguous(v_depths),
+            v_conics.contiguous(), _contiguous(v_compensations if antialiased else None), v_means, v_quats, v_scales, v_covars, partials, N,
+            C, width, height, eps2d, MODEL=model, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, LARGEST=LARGEST, SUMS=SUMS,
+            **options, enable_fp_fusion=True)
+        if partials is not None:
+            sums = partials.sum(0)                      # [C, SUMS]
+            v_viewmats[:, :3] = sums[:, :12].view(C, 3, 4)
+            v_Ks.diagonal(0, 1, 2)[:, :2] = sums[:, 12:14]
+            v_Ks[:, :2, 2] = sums[:, 14:]
     return v_means, v_quats, v_scales, v_covars, v_viewmats, v_Ks
 
 

@@ -5,34 +5,30 @@ from __future__ import annotations
 import torch
 import tsplat_reference as reference
 from torch import Tensor
-from torch.library import custom_op
 from tsplat_reference import Bins
 
-from tsplat.ops.common import register_autocast, run_kernel
+from tsplat.ops.common import Op, run_kernel
 
 
 def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
                ) -> Bins:
     """`tsplat_reference.bin_splats` as an op; its number of hits depends on the data."""
-    return Bins(*bin_splats_op(means2d.detach(), radii, conics.detach(), opacities.detach(), depths.detach(), width, height, tile))
+    return Bins(*bin_splats_op(means2d, radii, conics, opacities, depths, width, height, tile))
 
 
-@custom_op("tsplat::bin_splats", mutates_args=())
-def bin_splats_op(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
-                  ) -> tuple[Tensor, Tensor]:
+def _bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
+                ) -> tuple[Tensor, Tensor]:
     """Ids and offsets."""
     ids, offsets = run_kernel("binning", "bin_splats", means2d, means2d, radii, conics, opacities, depths, width, height, tile)
     return ids, offsets
 
 
-@bin_splats_op.register_kernel("cpu")
 def _bin_splats_cpu(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
                     ) -> tuple[Tensor, Tensor]:
     ids, offsets = reference.bin_splats(means2d, radii, conics, opacities, depths, width, height, tile)
     return ids, offsets
 
 
-@bin_splats_op.register_fake
 def _bin_splats_fake(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
                      ) -> tuple[Tensor, Tensor]:
     hits = torch.library.get_ctx().new_dynamic_size()
@@ -41,4 +37,4 @@ def _bin_splats_fake(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: 
             means2d.new_empty(means2d.shape[0] * tiles_x * tiles_y + 1, dtype=torch.int64))
 
 
-register_autocast(bin_splats_op)
+bin_splats_op = Op("tsplat::bin_splats", _bin_splats, cpu=_bin_splats_cpu, fake=_bin_splats_fake)

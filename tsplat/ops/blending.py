@@ -6,9 +6,8 @@ from typing import Any
 
 import tsplat_reference as reference
 from torch import Tensor
-from torch.library import custom_op
 
-from tsplat.ops.common import contiguous, register_autocast, reject_forward_mode, run_kernel, second_derivative
+from tsplat.ops.common import Op, contiguous, run_kernel, second_derivative
 
 Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
 
@@ -19,24 +18,21 @@ def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ba
 
     `absgrad` `[C, N, 2]` changes nothing in the result; as its gradient it receives the sum over pixels of |dL/dmeans2d|.
     """
-    reject_forward_mode("blend", means2d, conics, opacities, colors, backgrounds)
     image, alphas = blend_op(means2d, conics, opacities, colors, backgrounds, absgrad, ids, offsets, width, height, tile, alpha_max)
     return image, alphas
 
 
-@custom_op("tsplat::blend", mutates_args=())
-def blend_op(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None,
-             ids: Tensor, offsets: Tensor, width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
+def _blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None,
+           ids: Tensor, offsets: Tensor, width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
     """Image and alpha."""
     image, alphas = run_kernel("blending", "blend", means2d, means2d, conics, opacities, colors, backgrounds, ids, offsets, width, height,
                                tile, alpha_max)
     return image, alphas
 
 
-@custom_op("tsplat::blend_backward", mutates_args=())
-def blend_backward_op(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
-                      offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int,
-                      tile: int, alpha_max: float, absgrad: bool) -> Six:
+def _blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
+                    offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int,
+                    tile: int, alpha_max: float, absgrad: bool) -> Six:
     """Gradients of means2d, conics, opacities, colors and backgrounds, and the absolute gradient, `[C, 0, 2]` unless asked for."""
     v_means2d, v_conics, v_opacities, v_colors, v_backgrounds, v_abs = run_kernel(
         "blending", "blend_backward", means2d, means2d, conics, opacities, colors, backgrounds, ids, offsets, image, alphas, v_image,
@@ -44,23 +40,17 @@ def blend_backward_op(means2d: Tensor, conics: Tensor, opacities: Tensor, colors
     return v_means2d, v_conics, v_opacities, v_colors, v_backgrounds, v_abs
 
 
-@blend_op.register_kernel("cpu")
 def _blend_cpu(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None,
                *lists: Any) -> tuple[Tensor, Tensor]:
     return reference.blend_blocks(means2d, conics, opacities, colors, backgrounds, *lists)
 
 
-blend_backward_op.register_kernel("cpu")(contiguous(reference.blend_blocks_backward))
-
-
-@blend_op.register_fake
 def _blend_fake(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None,
                 ids: Tensor, offsets: Tensor, width: int, height: int, *_: Any) -> tuple[Tensor, Tensor]:
     shape = means2d.shape[0], height, width
     return colors.new_empty(*shape, colors.shape[2]), colors.new_empty(shape)
 
 
-@blend_backward_op.register_fake
 def _blend_backward_fake(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
                          offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int,
                          tile: int, alpha_max: float, absgrad: bool) -> Six:
@@ -101,6 +91,6 @@ def _double_backward(ctx: Any, *v_gradients: Tensor) -> tuple[Any, ...]:
     return *v_inputs, *[None] * 4, *v_cotangents, *[None] * 5
 
 
-blend_op.register_autograd(_backward, setup_context=_save)
-blend_backward_op.register_autograd(_double_backward, setup_context=_save_backward)
-register_autocast(blend_op, blend_backward_op)
+blend_op = Op("tsplat::blend", _blend, cpu=_blend_cpu, fake=_blend_fake, setup=_save, backward=_backward)
+blend_backward_op = Op("tsplat::blend_backward", _blend_backward, cpu=contiguous(reference.blend_blocks_backward), fake=_blend_backward_fake,
+                       setup=_save_backward, backward=_double_backward)

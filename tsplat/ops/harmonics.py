@@ -7,50 +7,49 @@ from typing import Any
 import torch
 import tsplat_reference as reference
 from torch import Tensor
-from torch.library import custom_op
 
-from tsplat.ops.common import contiguous, register_autocast, register_loop_vmap, reject_forward_mode, run_kernel, second_derivative
+from tsplat.ops.common import Op, contiguous, run_kernel, second_derivative
 
 Three = tuple[Tensor, Tensor, Tensor]
 
 
 def harmonics(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:
     """`tsplat_reference.harmonics` as an op, with gradients to means, centers and coeffs."""
-    reject_forward_mode("harmonics", means, centers, coeffs)
     out: Tensor = harmonics_op(means, centers, coeffs, degree, mask)
     return out
 
 
-@custom_op("tsplat::harmonics", mutates_args=())
-def harmonics_op(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:
+def _harmonics(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:
     """`[C, N, D]`."""
     out: Tensor = run_kernel("harmonics", "harmonics", means, means, centers, coeffs, degree, mask)
     return out
 
 
-@custom_op("tsplat::harmonics_backward", mutates_args=())
-def harmonics_backward_op(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor, v_out: Tensor) -> Three:
-    """Gradients of means, centers and coeffs."""
-    v_means, v_centers, v_coeffs = run_kernel("harmonics", "harmonics_backward", means, means, centers, coeffs, degree, mask, v_out)
+def _harmonics_backward(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor, v_out: Tensor, cameras: bool = True
+                        ) -> Three:
+    """Gradients of means, centers (`[0, 3]` without `cameras`) and coeffs."""
+    v_means, v_centers, v_coeffs = run_kernel("harmonics", "harmonics_backward", means, means, centers, coeffs, degree, mask, v_out, cameras)
     return v_means, v_centers, v_coeffs
 
 
-@harmonics_op.register_kernel("cpu")
 def _harmonics_cpu(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:
     return reference.harmonics(means, centers, coeffs, degree, mask).contiguous()
 
 
-harmonics_backward_op.register_kernel("cpu")(contiguous(reference.harmonics_backward))
-
-
-@harmonics_op.register_fake
 def _harmonics_fake(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:
     return coeffs.new_empty(centers.shape[0], means.shape[0], coeffs.shape[2])
 
 
-@harmonics_backward_op.register_fake
-def _harmonics_backward_fake(means: Tensor, centers: Tensor, coeffs: Tensor, *_: Any) -> Three:
-    return means.new_empty(means.shape), centers.new_empty(centers.shape), coeffs.new_empty(coeffs.shape)
+@contiguous
+def _harmonics_backward_cpu(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor, v_out: Tensor, cameras: bool = True
+                            ) -> Three:
+    v_means, v_centers, v_coeffs = reference.harmonics_backward(means, centers, coeffs, degree, mask, v_out)
+    return v_means, v_centers if cameras else centers.new_empty(0, 3), v_coeffs
+
+
+def _harmonics_backward_fake(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor, v_out: Tensor, cameras: bool = True
+                             ) -> Three:
+    return means.new_empty(means.shape), centers.new_empty(centers.shape if cameras else (0, 3)), coeffs.new_empty(coeffs.shape)
 
 
 def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -60,12 +59,14 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
 
 def _backward(ctx: Any, v_out: Tensor) -> tuple[Any, ...]:
     means, centers, coeffs, mask = ctx.saved_tensors
-    v_means, v_centers, v_coeffs = harmonics_backward_op(means, centers, coeffs, ctx.degree, mask, v_out.contiguous())
-    return v_means, v_centers, v_coeffs, None, None
+    cameras = ctx.needs_input_grad[1]
+    v_means, v_centers, v_coeffs = harmonics_backward_op(means, centers, coeffs, ctx.degree, mask, v_out.contiguous(), cameras)
+    return v_means, v_centers if cameras else None, v_coeffs, None, None
 
 
 def _save_backward(ctx: Any, inputs: tuple[Any, ...], output: Three) -> None:
-    means, centers, coeffs, ctx.degree, mask, v_out = inputs
+    means, centers, coeffs, ctx.degree, mask, v_out = inputs[:6]
+    ctx.cameras = all(inputs[6:])
     ctx.save_for_backward(means, centers, coeffs, mask, v_out)
 
 
@@ -76,11 +77,11 @@ def _double_backward(ctx: Any, *v_gradients: Tensor) -> tuple[Any, ...]:
         finite = torch.where(coeffs.isfinite(), coeffs, 0.0)        # the colour of the others is not drawn: their gradient is 0, not NaN
         return [reference.harmonics(means, centers, finite, ctx.degree, mask)]
 
-    v_inputs, (v_v_out,) = second_derivative(forward, (means, centers, coeffs), (v_out,), v_gradients)
-    return *v_inputs, None, None, v_v_out
+    v_means, v_centers, v_coeffs = v_gradients
+    v_inputs, (v_v_out,) = second_derivative(forward, (means, centers, coeffs), (v_out,), (v_means, v_centers if ctx.cameras else None, v_coeffs))
+    return *v_inputs, None, None, v_v_out, None
 
 
-harmonics_op.register_autograd(_backward, setup_context=_save)
-harmonics_backward_op.register_autograd(_double_backward, setup_context=_save_backward)
-register_autocast(harmonics_op, harmonics_backward_op)
-register_loop_vmap(harmonics_op, harmonics_backward_op)
+harmonics_op = Op("tsplat::harmonics", _harmonics, cpu=_harmonics_cpu, fake=_harmonics_fake, setup=_save, backward=_backward, vmap=True)
+harmonics_backward_op = Op("tsplat::harmonics_backward", _harmonics_backward, cpu=_harmonics_backward_cpu,
+                           fake=_harmonics_backward_fake, setup=_save_backward, backward=_double_backward, vmap=True)

@@ -207,7 +207,7 @@ def stage_calls(scene: Scene) -> tuple[dict[str, Callable[[], object]], int, int
         "bin": lambda: ops.bin_splats(*to_bin),
         "blend": lambda: ops.blend(*splats, None, *lists, *options),
         "blend_backward": lambda: blend_backward_op(*splats, *lists, *outputs, *upstream, *options, False),
-        "project_backward": lambda: project_backward_op(*shape, scene.opacities, *matrices, *planes, p.radii, *v),
+        "project_backward": lambda: project_backward_op(*shape, scene.opacities, *matrices, *planes, p.radii, v[0], None, v[2], None, False),
     }
     return calls, int((p.radii > 0).all(-1).sum()), len(bins.ids)
 

@@ -351,7 +351,8 @@ def test_both_forms_agree(backend: Backend, name: str) -> None:
     for form in (op, op.custom):
         results = form(*args)
         results = [results] if isinstance(results, Tensor) else list(results)
-        loss = sum(r.square().sum() for r in results[:5] if r.requires_grad)
+        differentiable = results[:4] if name.startswith("blend_backward") else results                 # the absolute gradient is not
+        loss = sum(r.square().sum() for r in differentiable if r.requires_grad)
         v = torch.autograd.grad(loss, inputs, create_graph=name in FORWARD, materialize_grads=True)
         if name in DIFFERENTIABLE:
             v += torch.autograd.grad(sum(x.square().sum() for x in v), inputs, materialize_grads=True)

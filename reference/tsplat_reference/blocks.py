@@ -181,21 +181,21 @@ def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Ten
 
 def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
                           offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int,
-                          tile: int, alpha_max: float, absgrad: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Closed-form gradients of `blend` with respect to means2d, conics, opacities, colors and backgrounds.
+                          tile: int, alpha_max: float, absgrad: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Closed-form gradients of `blend` with respect to means2d, conics, opacities and colors. (That of the background is the sum of
+    (1 - alpha) dL/dimage.)
 
     With L the loss, g_i = <c_i - background, dL/dimage> + dL/dalpha and the rest R_i = sum_{j > i} w_j g_j:
     dL/dlog alpha_i = w_i g_i - alpha_i/(1 - alpha_i) R_i = w_i (g_i - R_i/T_{i+1}).
     Front to back, R starts as the sum over all splats, which is known from the image, and loses one term at each.
 
-    The sixth result is the absolute gradient `[C, N, 2]`: sum over pixels of |dL/dmean2d| per axis (AbsGS); empty unless asked for.
+    The fifth result is the absolute gradient `[C, N, 2]`: sum over pixels of |dL/dmean2d| per axis (AbsGS); empty unless asked for.
     """
     lists = _lists(means2d, conics, opacities, colors, ids, offsets, width, height, tile, alpha_max)
     C, N, D = *opacities.shape, colors.shape[-1]
     if backgrounds is None:
-        v_backgrounds, behind = v_image.new_zeros(C, D), torch.zeros_like(v_alphas)
+        behind = torch.zeros_like(v_alphas)
     else:
-        v_backgrounds = torch.einsum("chwd,chw->cd", v_image, 1 - alphas)
         behind = torch.einsum("chwd,cd->chw", v_image, backgrounds)                         # <background, dL/dimage>
     upstream = to_tiles(torch.cat([v_image, (v_alphas - behind)[..., None]], -1), tile)     # [tiles, D + 1, P]
     rest = to_tiles(((image * v_image).sum(-1) + alphas * v_alphas - behind)[..., None], tile)[:, 0]
@@ -235,7 +235,7 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
                     v_abs[axis].index_add_(0, group.splats, sum_abs.flatten())
     v_means2d, v_conics, v_opacities = footprint.records_backward(conics.reshape(-1, 3), opacities.flatten(), v_records)
     return (v_means2d.view_as(means2d), v_conics.view_as(conics), v_opacities.view_as(opacities), v_colors.T.reshape(colors.shape),
-            v_backgrounds, v_abs.T.reshape(C, -1, 2))
+            v_abs.T.reshape(C, -1, 2))
 
 
 def _log_alpha_gradient(v: Tensor, weight: Tensor, T: Tensor, product: Tensor, rest: Tensor) -> None:

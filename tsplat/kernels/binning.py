@@ -17,7 +17,7 @@ from torch import Tensor
 from tsplat_reference.constants import ALPHA_MIN, BIN_SLACK, BIN_SLACK_RELATIVE, EXTENT_MAX
 
 from tsplat.kernels.footprint import TILE
-from tsplat.kernels.launch import ceil_div, launch
+from tsplat.kernels.launch import Launcher, ceil_div, launch
 
 SIDE = tl.constexpr(8)
 """Tiles along the side of a bin: a row of them is a byte."""
@@ -90,6 +90,7 @@ def count_hits(mx, my, a, b, c, level, det, half, real, W, H, TILE: tl.constexpr
     return count
 
 
+@Launcher
 @triton.jit(do_not_specialize=["R", "W", "H"])
 def count_kernel(radii, means2d, conics, opacities, counts, totals, R, W, H, EPS: tl.constexpr, TILE: tl.constexpr, SIDE: tl.constexpr,
                  BLOCK: tl.constexpr):
@@ -104,6 +105,7 @@ def count_kernel(radii, means2d, conics, opacities, counts, totals, R, W, H, EPS
     tl.atomic_add(totals + 1, tl.sum(tiles.to(tl.int64), 0), sem="relaxed")
 
 
+@Launcher
 @triton.jit(do_not_specialize=["R", "N", "W", "H", "bins_x", "bins_y", "capacity"])
 def emit_kernel(order, radii, means2d, conics, opacities, counts, ends, keys, ids, R, N, W, H, bins_x, bins_y, capacity,
                 EPS: tl.constexpr, TILE: tl.constexpr, SIDE: tl.constexpr, BLOCK: tl.constexpr):
@@ -128,6 +130,7 @@ def emit_kernel(order, radii, means2d, conics, opacities, counts, ends, keys, id
         row += 1
 
 
+@Launcher
 @triton.jit(do_not_specialize=["M", "bins", "bins_x", "bins_y", "W", "H"])
 def mask_kernel(keys, by_bin, ids, means2d, conics, opacities, sorted_ids, masks, M, bins, bins_x, bins_y, W, H, EPS: tl.constexpr,
                 TILE: tl.constexpr, SIDE: tl.constexpr, BLOCK: tl.constexpr):
@@ -151,6 +154,7 @@ def mask_kernel(keys, by_bin, ids, means2d, conics, opacities, sorted_ids, masks
         row += 1
 
 
+@Launcher
 @triton.jit(do_not_specialize=["M", "bins_x", "bins_y", "tiles_x", "tiles_y", "capacity"])
 def pick_kernel(edges, sorted_ids, masks, offsets, counts, ids, M, bins_x, bins_y, tiles_x, tiles_y, capacity, WRITE: tl.constexpr,
                 SIDE: tl.constexpr, BLOCK: tl.constexpr):

@@ -8,7 +8,6 @@ channels go through matrix products, in `feature_blending.py`.
 from __future__ import annotations
 
 import functools
-import math
 
 import torch
 import triton
@@ -18,7 +17,7 @@ from torch import Tensor
 from tsplat.kernels import footprint
 from tsplat.kernels.feature_blending import feature_bwd_kernel, feature_fwd_kernel
 from tsplat.kernels.footprint import LOG2_MIN, T_MIN, TILE
-from tsplat.kernels.launch import ceil_div, current_target, launch
+from tsplat.kernels.launch import Launcher, ceil_div, current_target, launch
 
 CHANNELS = 4
 """Up to here a splat's colour is in its record and a pixel's in registers."""
@@ -152,6 +151,7 @@ def splat_alpha(mx, my, l00, l10, l11, log2_opacity, x, y, T, log2_alpha: tl.con
     return alpha
 
 
+@Launcher
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null"])
 def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, W, H, tiles_x, tiles_y, null, D: tl.constexpr,
                      BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, LANES: tl.constexpr,
@@ -265,6 +265,7 @@ def tile_sums(s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, COUNT: tl.conste
         return first, row, second, row + 8, row < COUNT - 8
 
 
+@Launcher
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null"])
 def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image, v_alphas, sums, lane_x, W, H, tiles_x, tiles_y, null,
                      D: tl.constexpr, ALPHA_MAX: tl.constexpr, BACKGROUND: tl.constexpr, ABSGRAD: tl.constexpr, PER_HIT: tl.constexpr,
@@ -357,7 +358,8 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
 @functools.cache
 def _lane_x(lanes: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """`[lanes, 4]`: x about the tile's centre of every second pixel of each lane's row."""
-    return (torch.arange(0, TILE.value, 2, device=device).to(dtype) - (TILE.value / 2 - 0.5)).repeat(lanes, 1)
+    tile = int(TILE.value)
+    return (torch.arange(0, tile, 2, device=device).to(dtype) - (tile / 2 - 0.5)).repeat(lanes, 1)
 
 
 class _Scene:
@@ -407,7 +409,7 @@ def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ba
 
 def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
                    offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int, tile: int,
-                   alpha_max: float, absgrad: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+                   alpha_max: float, absgrad: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Launcher; see `tsplat_reference.blend_blocks_backward`.
 
     Sums over pixels are atomic, so that their last bits differ from run to run, but not under `torch.use_deterministic_algorithms(True)`:
@@ -420,16 +422,15 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
     s = _Scene(means2d, conics, opacities, colors, backgrounds, ids, offsets, width, height, tile, alpha_max)
     v_image, v_alphas = v_image.contiguous(), v_alphas.contiguous()
     sums = means2d.new_zeros(len(ids) if deterministic else s.R + 1, SUMS)
-    v_colors = torch.zeros_like(s.colors)
-    if s.D <= CHANNELS:
+    few = s.D <= CHANNELS
+    v_colors = colors.new_empty(s.C, s.N, s.D) if few else torch.zeros_like(s.colors)
+    if few:
         blend_bwd_kernel[(s.blocks,)](s.records, ids, offsets, s.backgrounds, image, alphas, v_image, v_alphas, sums, s.lane_x, width,
-                                     height, *s.grid, s.R, BACKGROUND=backgrounds is not None, ABSGRAD=absgrad, PER_HIT=deterministic,
-                                     lane_moments=footprint.lane_moments, mean_slopes=footprint.mean_slopes,
-                                     **launch("blend_backward"), **s.warp)
+                                      height, *s.grid, s.R, BACKGROUND=backgrounds is not None, ABSGRAD=absgrad, PER_HIT=deterministic,
+                                      lane_moments=footprint.lane_moments, mean_slopes=footprint.mean_slopes,
+                                      **launch("blend_backward"), **s.warp)
         if deterministic:
             sums = means2d.new_zeros(s.R + 1, SUMS).index_add_(0, ids.long(), sums)
-        v_colors = sums[:s.R, 6:6 + s.D].view(s.C, s.N, s.D)
-        v_colors = v_colors.sum(0, keepdim=True) if colors.shape[0] < s.C else v_colors.contiguous()
     else:
         behind = 0.0 if backgrounds is None else torch.einsum("chwd,cd->chw", v_image, backgrounds)
         rest = torch.einsum("chwd,chwd->chw", image, v_image) + alphas * v_alphas - behind
@@ -439,17 +440,19 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
             max(s.rows, 1), s.D, ABSGRAD=absgrad,
             block_moments=footprint.block_moments, mean_slopes=footprint.mean_slopes, **options, **s.block)
     v_means2d, v_conics, v_opacities = torch.empty_like(means2d), torch.empty_like(s.conics), torch.empty_like(s.opacities)
-    options = launch("records")
-    footprint.unpack_kernel[(max(1, ceil_div(s.R, options["BLOCK"])),)](sums, s.conics, s.opacities, v_means2d, v_conics, v_opacities, s.R,
-                                                                        STRIDE=SUMS, **options)
-    v_backgrounds = v_image.new_zeros(s.C, s.D) if backgrounds is None else torch.einsum("chwd,chw->cd", v_image, 1 - alphas)
-    v_abs = (2 * math.log(2) * sums[:s.R, 10:12]).view(s.C, s.N, 2) if absgrad else means2d.new_empty(s.C, 0, 2)
-    return v_means2d, v_conics, v_opacities, v_colors, v_backgrounds, v_abs
+    v_abs = means2d.new_empty(s.C, s.N if absgrad else 0, 2)
+    if s.R:
+        options = launch("records")
+        footprint.unpack_kernel[(ceil_div(s.R, options["BLOCK"]),)](sums, s.conics, s.opacities, v_means2d, v_conics, v_opacities, v_colors,
+                                                                    v_abs, s.R, D=s.D if few else 0, ABSGRAD=absgrad, STRIDE=SUMS, **options)
+    if few and colors.shape[0] < s.C:
+        v_colors = v_colors.sum(0, keepdim=True)
+    return v_means2d, v_conics, v_opacities, v_colors, v_abs
 
 
 def _in_passes(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor, offsets: Tensor,
                image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int, tile: int, alpha_max: float,
-               absgrad: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]:
+               absgrad: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """The backward by 4 channels at a time: it is linear in the upstream gradient, of which alpha's goes with the first pass."""
     if absgrad:
         raise NotImplementedError(f"absgrad: not deterministic for more than {CHANNELS} channels; got {colors.shape[2]}. "
@@ -462,4 +465,4 @@ def _in_passes(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tenso
         parts.append(blend_backward(means2d, conics, opacities, colors[..., some], background, ids, offsets, image[..., some].contiguous(),
                                     alphas, v_image[..., some], v_some, width, height, tile, alpha_max, False))
     geometry = [torch.stack(v).sum(0) for v in list(zip(*parts, strict=True))[:3]]
-    return (geometry[0], geometry[1], geometry[2], torch.cat([p[3] for p in parts], -1), torch.cat([p[4] for p in parts], -1), parts[0][5])
+    return geometry[0], geometry[1], geometry[2], torch.cat([p[3] for p in parts], -1), parts[0][4]

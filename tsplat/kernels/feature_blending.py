@@ -10,6 +10,7 @@ import triton
 import triton.language as tl
 
 from tsplat.kernels.footprint import LOG2_MIN, T_MIN, TILE
+from tsplat.kernels.launch import Launcher
 
 
 @triton.jit
@@ -51,7 +52,8 @@ def chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha: tl.co
     return splat, mx, my, l00, l10, l11, alpha, front * alpha, tl.min(tl.where(counts, behind, T[:, None]), 1)
 
 
-@triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null", "N"])
+@Launcher
+@triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null", "N", "D"])
 def feature_fwd_kernel(records, colors, ids, offsets, backgrounds, image, alphas, W, H, tiles_x, tiles_y, null, N, D,
                        BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, P: tl.constexpr, K: tl.constexpr,
                        DB: tl.constexpr, PRECISION: tl.constexpr):
@@ -79,7 +81,8 @@ def feature_fwd_kernel(records, colors, ids, offsets, backgrounds, image, alphas
         tl.store(alphas + pixel, 1.0 - T, mask=inside)
 
 
-@triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null", "N"])
+@Launcher
+@triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null", "N", "D"])
 def feature_bwd_kernel(records, colors, ids, offsets, rest_image, v_weights, v_image, sums, v_colors, W, H, tiles_x, tiles_y, null, N, D,
                        ABSGRAD: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, block_moments: tl.constexpr,
                        mean_slopes: tl.constexpr, P: tl.constexpr, K: tl.constexpr, DB: tl.constexpr, PRECISION: tl.constexpr):

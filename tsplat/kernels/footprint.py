@@ -16,6 +16,8 @@ import triton
 import triton.language as tl
 from tsplat_reference.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 
+from tsplat.kernels.launch import Launcher
+
 LOG2_MIN = tl.constexpr(math.log2(ALPHA_MIN))
 T_MIN = tl.constexpr(TRANSMITTANCE_MIN)
 TILE = tl.constexpr(8)
@@ -67,6 +69,7 @@ def block_moments(v, mx, my, x, y):
             tl.sum(vx * dx, 0, keep_dims=True), tl.sum(vx * dy, 0, keep_dims=True), tl.sum(vy * dy, 0, keep_dims=True))
 
 
+@Launcher
 @triton.jit(do_not_specialize=["R", "N"])
 def pack_kernel(means2d, conics, opacities, colors, records, R, N, D: tl.constexpr, BLOCK: tl.constexpr):
     """Records of splats; culled ones (conic 0) get finite numbers. Record R is the null splat, which is nowhere.
@@ -97,9 +100,11 @@ def pack_kernel(means2d, conics, opacities, colors, records, R, N, D: tl.constex
         tl.store(p + 6 + channel, tl.load(colors + (i % N) * D + channel, mask=real, other=0.0), mask=inside)
 
 
+@Launcher
 @triton.jit(do_not_specialize=["R"])
-def unpack_kernel(sums, conics, opacities, v_means2d, v_conics, v_opacities, R, STRIDE: tl.constexpr, BLOCK: tl.constexpr):
-    """Moments `[R, STRIDE]` to the gradients of means2d, conics and opacities."""
+def unpack_kernel(sums, conics, opacities, v_means2d, v_conics, v_opacities, v_colors, v_abs, R, D: tl.constexpr, ABSGRAD: tl.constexpr,
+                  STRIDE: tl.constexpr, BLOCK: tl.constexpr):
+    """Sums `[R, STRIDE]` to the gradients of means2d, conics, opacities and D colours, and the absolute gradient."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     real = i < R
     a = tl.load(conics + 3 * i, mask=real, other=0.0)
@@ -116,3 +121,9 @@ def unpack_kernel(sums, conics, opacities, v_means2d, v_conics, v_opacities, R, 
     tl.store(v_conics + 3 * i + 1, -tl.load(p + 4, mask=real, other=0.0), mask=real)
     tl.store(v_conics + 3 * i + 2, -0.5 * tl.load(p + 5, mask=real, other=0.0), mask=real)
     tl.store(v_opacities + i, tl.where(opacity > 0, s0 / tl.where(opacity > 0, opacity, 1.0), 0.0), mask=real)
+    for channel in tl.static_range(D):
+        tl.store(v_colors + i * D + channel, tl.load(p + 6 + channel, mask=real, other=0.0), mask=real)
+    if ABSGRAD:
+        scale = tl.full((), 1.3862943611198906, a.dtype)    # 2 ln 2
+        tl.store(v_abs + 2 * i, scale * tl.load(p + 10, mask=real, other=0.0), mask=real)
+        tl.store(v_abs + 2 * i + 1, scale * tl.load(p + 11, mask=real, other=0.0), mask=real)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+import torch
 import tsplat_reference as reference
 from torch import Tensor
 
 from tsplat.ops.common import Op, contiguous, run_kernel, second_derivative
 
-Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+Five = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None,
@@ -32,12 +33,12 @@ def _blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, b
 
 def _blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
                     offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int,
-                    tile: int, alpha_max: float, absgrad: bool) -> Six:
-    """Gradients of means2d, conics, opacities, colors and backgrounds, and the absolute gradient, `[C, 0, 2]` unless asked for."""
-    v_means2d, v_conics, v_opacities, v_colors, v_backgrounds, v_abs = run_kernel(
+                    tile: int, alpha_max: float, absgrad: bool) -> Five:
+    """Gradients of means2d, conics, opacities and colors, and the absolute gradient, `[C, 0, 2]` unless asked for."""
+    v_means2d, v_conics, v_opacities, v_colors, v_abs = run_kernel(
         "blending", "blend_backward", means2d, means2d, conics, opacities, colors, backgrounds, ids, offsets, image, alphas, v_image,
         v_alphas, width, height, tile, alpha_max, absgrad)
-    return v_means2d, v_conics, v_opacities, v_colors, v_backgrounds, v_abs
+    return v_means2d, v_conics, v_opacities, v_colors, v_abs
 
 
 def _blend_cpu(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None,
@@ -53,9 +54,9 @@ def _blend_fake(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tens
 
 def _blend_backward_fake(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
                          offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int,
-                         tile: int, alpha_max: float, absgrad: bool) -> Six:
+                         tile: int, alpha_max: float, absgrad: bool) -> Five:
     C, N = opacities.shape
-    return (*(x.new_empty(x.shape) for x in (means2d, conics, opacities, colors)), colors.new_empty(C, colors.shape[2]),
+    return (*(x.new_empty(x.shape) for x in (means2d, conics, opacities, colors)),
             means2d.new_empty(C, N if absgrad else 0, 2))  # type: ignore[return-value]
 
 
@@ -67,11 +68,12 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> N
 
 def _backward(ctx: Any, v_image: Tensor, v_alphas: Tensor) -> tuple[Any, ...]:
     tensors = ctx.saved_tensors
-    *v_inputs, v_backgrounds, v_abs = blend_backward_op(*tensors, v_image.contiguous(), v_alphas.contiguous(), *ctx.options, ctx.absgrad)
-    return *v_inputs, v_backgrounds if tensors[4] is not None else None, v_abs if ctx.absgrad else None, *[None] * 6
+    *v_inputs, v_abs = blend_backward_op(*tensors, v_image.contiguous(), v_alphas.contiguous(), *ctx.options, ctx.absgrad)
+    v_backgrounds = torch.einsum("chwd,chw->cd", v_image, 1 - tensors[8]) if ctx.needs_input_grad[4] else None
+    return *v_inputs, v_backgrounds, v_abs if ctx.absgrad else None, *[None] * 6
 
 
-def _save_backward(ctx: Any, inputs: tuple[Any, ...], output: Six) -> None:
+def _save_backward(ctx: Any, inputs: tuple[Any, ...], output: Five) -> None:
     *differentiable, ids, offsets, _, _, v_image, v_alphas = inputs[:11]
     ctx.options = inputs[11:15]
     ctx.set_materialize_grads(False)
@@ -79,7 +81,7 @@ def _save_backward(ctx: Any, inputs: tuple[Any, ...], output: Six) -> None:
 
 
 def _double_backward(ctx: Any, *v_gradients: Tensor) -> tuple[Any, ...]:
-    if v_gradients[5] is not None:
+    if v_gradients[4] is not None:
         raise NotImplementedError("tsplat: absgrad has no derivative; it is a measure for density control")
     means2d, conics, opacities, colors, backgrounds, ids, offsets, v_image, v_alphas = ctx.saved_tensors
 
@@ -87,7 +89,7 @@ def _double_backward(ctx: Any, *v_gradients: Tensor) -> tuple[Any, ...]:
         return reference.blend(means2d, conics, opacities, colors, backgrounds, ids, offsets, *ctx.options)
 
     v_inputs, v_cotangents = second_derivative(forward, (means2d, conics, opacities, colors, backgrounds), (v_image, v_alphas),
-                                               v_gradients[:5])
+                                               (*v_gradients[:4], None))
     return *v_inputs, *[None] * 4, *v_cotangents, *[None] * 5
 
 

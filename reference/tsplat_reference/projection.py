@@ -165,7 +165,8 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
     v_W = matmul(transpose(J), v_M)
     v_u, v_v = (torch.where(valid, v, 0.0) for v in v_means2d.unbind(-1))
     v_p, v_Ks = project_points_backward(p, intrinsics, width, height, model, v_u, v_v, matmul(v_M, transpose(W)))
-    v_x, v_y, v_z = (torch.where(valid, v, 0.0) for v in (*v_p[:2], v_p[2] if v_depths is None else v_p[2] + v_depths))
+    zero = det.new_zeros(())                            # of the right dtype, as v_p[2] may be the number 0.0
+    v_x, v_y, v_z = (torch.where(valid, v, zero) for v in (*v_p[:2], v_p[2] if v_depths is None else v_p[2] + v_depths))
 
     # p = W mean + t
     v_viewmats, v_Ks = (torch.zeros_like(viewmats), v_Ks) if cameras else (viewmats.new_empty(0, 4, 4), Ks.new_empty(0, 3, 3))

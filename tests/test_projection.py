@@ -239,6 +239,42 @@ def test_float32_is_as_good_as_float32_can_be(model: str) -> None:
     assert_close(gradients(got[1:], inputs32), gradients(want[1:], inputs64), 1e-4)
 
 
+def needles(ratio: float) -> tuple[scenes.Splats3D, Camera]:
+    """Splats up to a few hundred pixels long, `ratio` times as long as they are thick, in float32."""
+    s, cam = scenes.splats(500, size=(0.3, 1.0), opacity=(0.9, 0.9)), scenes.camera(2, 240, 170)
+    thin = s._replace(scales=s.scales * torch.tensor([1.0, 1 / ratio, 1 / ratio], dtype=torch.float64))
+    return scenes.Splats3D(*(x.float() for x in thin)), cam.to(torch.float32)
+
+
+def foreshortening(splats: scenes.Splats3D, cam: Camera, conics: Tensor) -> Tensor:
+    """`[C, N]`: how long a needle would be, seen from the side, over how long it is on the screen: at least |J| |S| / sqrt(trace Sigma')."""
+    z = torch.einsum("cj,nj->cn", cam.viewmats[:, 2, :3], splats.means) + cam.viewmats[:, 2, 3, None]
+    a, b, c = conics.double().unbind(-1)
+    length = ((a + c) / (a * c - b * b)).sqrt()                                # sqrt(trace) of the inverse
+    return 2 * cam.Ks[:, 0, 0, None] / z * splats.scales.amax(-1) / length       # |J| < 2 f/z, the clamp included
+
+
+@pytest.mark.parametrize("eps2d", [0.0, 0.3])
+@pytest.mark.parametrize("ratio", [1e2, 1e3, 1e4, 1e6])
+def test_needles_keep_float32s_precision(ratio: float, eps2d: float) -> None:
+    """The covariance is never formed from quaternion and scales, so its small eigenvalue is not lost: that takes (1/ratio)^2 > eps.
+
+    A column of T = J W R S is off by 13 u of |J| s, u = eps/2: 6 from R, 4 from J W, 3 from the product. Sigma' and its determinant take
+    two of them in each product, the conic one over the other: 52 u, and 6 more for the operations: 29 eps, times the foreshortening.
+    """
+    splats, cam = needles(ratio)
+    args = arguments(splats, cam, eps2d=eps2d, antialiased=True)
+    want = reference.project(*(a.double() if isinstance(a, Tensor) else a for a in args))
+    seen = (want.radii > 0).all(-1)
+    assert seen.sum() > 400
+    bound = 29 * torch.finfo(torch.float32).eps * foreshortening(splats, cam, want.conics)[seen].clamp_min(1.0)
+    got = ops.project(*args)
+    assert torch.equal((got.radii > 0).all(-1), seen)
+    off = torch.linalg.vector_norm(got.conics - want.conics, dim=-1) / torch.linalg.vector_norm(want.conics, dim=-1)
+    assert (off[seen] <= bound).all()
+    assert ((got.compensations / want.compensations - 1).abs()[seen] <= bound).all()
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("scale", [1e3, 1e6, 1e9, 1e11])
 def test_a_splat_huge_for_one_camera_and_culled_by_another_has_finite_gradients(dtype: torch.dtype, scale: float) -> None:

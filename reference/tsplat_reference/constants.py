@@ -19,6 +19,12 @@ BIN_SLACK = 1e-3
 """Added, with its relative twin, to the squared radius of the ellipse in tile tests: rounding may add a hit, but never lose one."""
 BIN_SLACK_RELATIVE = 1e-4
 
+BIN_ROUNDING = 4
+"""Slack of tile tests for rounding of the conic and, twice that, of positions, in units of eps: see `bin_splats`."""
+
+FLATTEST = 1e-30
+"""In tile tests, the least entry of a conic: a splat of 1e15 pixels, beyond which quotients might overflow float32."""
+
 FRUSTUM_MARGIN = 0.3
 """x/z and y/z in the pinhole Jacobian are clamped to the frustum widened by this part of its half size."""
 

@@ -13,7 +13,7 @@ EPS2D = 0.3
 """Added to the diagonal of the projected covariance, in pixels squared: the low-pass filter of EWA splatting."""
 
 EXTENT_MAX = 3.33
-"""Extent of a splat in standard deviations at the most: sqrt(2 ln 255), where an opaque splat falls to ALPHA_MIN."""
+"""Extent of an opaque splat in standard deviations: sqrt(2 ln 255), where it falls to ALPHA_MIN."""
 
 BIN_SLACK = 1e-3
 """Added, with its relative twin, to the squared radius of the ellipse in tile tests: rounding may add a hit, but never lose one."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tsplat_reference.camera import Point, project_points, project_points_backward, split_intrinsics
-from tsplat_reference.constants import ALPHA_MIN, COMPENSATION_MIN, EXTENT_MAX, LARGEST
+from tsplat_reference.constants import ALPHA_MIN, COMPENSATION_MIN, LARGEST
 from tsplat_reference.parallel import map_chunks
 from tsplat_reference.planes import Matrix, Plane, Vector, cross, dot, join, matmul, split, total, transpose
 
@@ -269,8 +269,8 @@ def _covariance2d(M: Matrix, F: Matrix, factored: bool) -> tuple[list[list[Plane
 
 
 def _extents(a: Tensor, c: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
-    """Half sizes of the box in which alpha can reach ALPHA_MIN: ceil(e sigma), e = min(3.33, sqrt(2 ln(255 o)))."""
-    e = (2 * torch.log(opacities.clamp_min(ALPHA_MIN) / ALPHA_MIN)).sqrt().clamp_max(EXTENT_MAX)
+    """Half sizes of the box in which alpha can reach ALPHA_MIN: ceil(e sigma), e = sqrt(2 ln(255 o)), which is 3.33 for an opaque splat."""
+    e = (2 * torch.log(opacities.clamp_min(ALPHA_MIN) / ALPHA_MIN)).sqrt()
     e = torch.where(opacities >= ALPHA_MIN, e, 0.0)
     rx, ry = ((e * v.clamp(0.0, 1e18).sqrt()).ceil().clamp_max(2.0**30) for v in (a, c))
     return rx, ry

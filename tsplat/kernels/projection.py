@@ -11,7 +11,7 @@ import torch
 import triton
 import triton.language as tl
 from torch import Tensor
-from tsplat_reference.constants import ALPHA_MIN, COMPENSATION_MIN, EXTENT_MAX, FRUSTUM_MARGIN, LARGEST
+from tsplat_reference.constants import ALPHA_MIN, COMPENSATION_MIN, FRUSTUM_MARGIN, LARGEST
 
 from tsplat.kernels.camera import (
     dot,
@@ -145,7 +145,7 @@ def half_size(extent, variance):
 @triton.jit(do_not_specialize=["N", "C", "width", "height"])
 def project_fwd_kernel(means, quats, scales, covars, opacities, viewmats, Ks, radii, means2d, depths, conics, compensations, N, C, width,
                        height, near: tl.float64, far: tl.float64, eps2d: tl.float64, MODEL: tl.constexpr, ANTIALIASED: tl.constexpr,
-                       MARGIN: tl.constexpr, FLOOR: tl.constexpr, ALPHA_MIN: tl.constexpr, EXTENT_MAX: tl.constexpr, LARGEST: tl.constexpr,
+                       MARGIN: tl.constexpr, FLOOR: tl.constexpr, ALPHA_MIN: tl.constexpr, LARGEST: tl.constexpr,
                        BLOCK: tl.constexpr):
     """One camera and one block of splats; the cameras of a block are neighbours, which find its splats in the cache."""
     camera = (tl.program_id(0) % C).to(tl.int64)
@@ -176,9 +176,8 @@ def project_fwd_kernel(means, quats, scales, covars, opacities, viewmats, Ks, ra
     if ANTIALIASED:
         scaling = compensation(det_sharp, det, FLOOR)[1]
         opacity *= scaling
-    # alpha reaches ALPHA_MIN at e standard deviations: e = min(EXTENT_MAX, sqrt(2 ln(o / ALPHA_MIN)))
+    # alpha reaches ALPHA_MIN at e standard deviations
     e = tl.sqrt(2.0 * tl.log(tl.where(opacity > ALPHA_MIN, opacity, ALPHA_MIN) / ALPHA_MIN))
-    e = tl.where(e < EXTENT_MAX, e, EXTENT_MAX)
     rx = half_size(e, tl.where(valid, a, 0.0))
     ry = half_size(e, tl.where(valid, c, 0.0))
     valid &= (opacity >= ALPHA_MIN) & (rx > 0) & (ry > 0) & (u + rx > 0) & (u - rx < width) & (v + ry > 0) & (v - ry < height)
@@ -309,7 +308,7 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
             project_fwd_kernel[(ceil_div(N, options["BLOCK"]) * C,)](
                 means.contiguous(), *map(_contiguous, (quats, scales, covars)), opacities.contiguous(), viewmats.contiguous(),
                 Ks.contiguous(), radii, means2d, depths, conics, compensations, N, C, width, height, near, far, eps2d, MODEL=model,
-                ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, ALPHA_MIN=ALPHA_MIN, EXTENT_MAX=EXTENT_MAX,
+                ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, ALPHA_MIN=ALPHA_MIN,
                 LARGEST=LARGEST, **options, enable_fp_fusion=True)
     return radii, means2d, depths, conics, compensations
 

@@ -149,24 +149,28 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
     trace = a0 + c0 + eps2d
     a, c, det = a0 + eps2d, c0 + eps2d, det_sharp + eps2d * trace
 
-    # conic Q = (A, B, C) = (c, -b, a)/det, the inverse of Sigma': v_Sigma' = -Q v_Q Q, where b and B stand for both entries off the diagonal
+    # conic Q = (A, B, C) = (c, -b, a)/det, the inverse of Sigma': v_Sigma' = -Q v_Q Q, where B stands for both entries off the diagonal.
+    # What is needed is G = 2 v_Sigma' T, or 2 v_Sigma' M if Sigma is given, by way of X = adj(Sigma' before blur) T/det and Q T, not of
+    # v_Sigma', of which most cancels in the product with a long T
     inverse = 1 / det
+    blur = eps2d * inverse
     v_A, v_B, v_C = v_conics.unbind(-1)
-    Q = [[c * inverse, -b * inverse], [-b * inverse, a * inverse]]
-    VQ = transpose(matmul([[v_A, 0.5 * v_B], [0.5 * v_B, v_C]], Q))                         # by columns
-    v_a, v_b, v_c = -dot(Q[0], VQ[0]), -2 * dot(Q[0], VQ[1]), -dot(Q[1], VQ[1])
-    if antialiased:                                                                         # d ratio = ratio (d det_sharp/det_sharp - d det/det)
+    V, Q = [[-2 * v_A, -v_B], [-v_B, -2 * v_C]], [[c * inverse, -b * inverse], [-b * inverse, a * inverse]]
+    if covars is None:
+        normal = [n * inverse for n in cross(*T)]
+        X = [cross(T[1], normal), cross(normal, T[0])]
+    else:
+        T, X = M, matmul([[c0 * inverse, Q[0][1]], [Q[1][0], a0 * inverse]], M)
+    G = matmul(Q, matmul(V, _combine(X, blur, T)))
+    if antialiased:                                                                         # ratio = det_sharp/(det_sharp + eps2d trace)
         ratio = det_sharp * inverse
-        v_ratio = torch.where(ratio >= COMPENSATION_MIN**2, v_compensations / (2 * ratio.sqrt()), 0.0) * (eps2d * inverse) * inverse
-        v_a, v_b, v_c = v_a + v_ratio * (c0 * c + b * b), v_b - 2 * v_ratio * b * trace, v_c + v_ratio * (a0 * a + b * b)
-    v_a, v_b, v_c = (torch.where(valid, v, 0.0) for v in (v_a, v_b, v_c))
+        v_ratio = torch.where(ratio >= COMPENSATION_MIN**2, v_compensations / ratio.sqrt(), 0.0) * blur
+        G = _combine(_combine(G, v_ratio * trace, X), -v_ratio * ratio, T)
+    G = [[torch.where(valid, g, 0.0) for g in row] for row in G]
 
-    # Sigma' = T T^T, T = M F; or M Sigma M^T, T = M Sigma
-    V = [[2 * v_a, v_b], [v_b, 2 * v_c]]
-    v_T = matmul(V, T)
-    v_F = matmul(transpose(M), v_T) if covars is None else matmul(transpose(M), matmul(V, M))
-    v_F = [[torch.as_tensor(v).sum(0) for v in row] for row in v_F]
-    v_M = matmul(v_T, transpose(F)) if covars is None else v_T
+    # Sigma' = T T^T, T = M F; or M Sigma M^T
+    v_F = [[torch.as_tensor(v).sum(0) for v in row] for row in matmul(transpose(M), G)]
+    v_M = matmul(G, transpose(F))
 
     # M = J W
     v_W = matmul(transpose(J), v_M)
@@ -266,6 +270,11 @@ def _covariance2d(M: Matrix, F: Matrix, factored: bool) -> tuple[list[list[Plane
         return T, a, b, c, a * c - b * b
     normal = cross(*T)
     return T, a, b, c, torch.as_tensor(dot(normal, normal))
+
+
+def _combine(A: Matrix, b: Tensor, B: Matrix) -> list[list[Plane]]:
+    """A + b B."""
+    return [[x + b * y for x, y in zip(*rows, strict=True)] for rows in zip(A, B, strict=True)]
 
 
 def _extents(a: Tensor, c: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:

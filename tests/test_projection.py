@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 import math
 from collections.abc import Sequence
@@ -272,6 +273,30 @@ def test_needles_keep_float32s_precision(ratio: float, eps2d: float) -> None:
     off = torch.linalg.vector_norm(got.conics - want.conics, dim=-1) / torch.linalg.vector_norm(want.conics, dim=-1)
     assert (off[seen] <= bound).all()
     assert ((got.compensations / want.compensations - 1).abs()[seen] <= bound).all()
+
+
+@pytest.mark.parametrize("ratio", [1e2, 1e3, 1e4, 1e6])
+def test_gradients_of_needles_keep_float32s_precision(ratio: float) -> None:
+    """Of conic and compensation, in closed form: -Q v_Q Q T must not be off by the length of T.
+
+    G = -2 Q V (Q T) is off by 100 u of |Q| |V| |Q T|: Q by 58, T by 13, the rest by products; |Q T| is at most 1/sqrt(2 eps2d), as
+    t/(t^2 + eps2d) at most 1/(2 sqrt(eps2d)) for each of two singular values. Scales get it times |J|, quaternions times |J| |S|, twice.
+    The compensation, between 0 and 1, has slopes of that size: at most 1/sqrt(eps2d) with respect to a singular value of T.
+    """
+    splats, cam = needles(ratio)
+    args = arguments(splats, cam, antialiased=True)
+    radii, *values = reference.project(*args)
+    upstream = [torch.zeros_like(v) for v in values]
+    upstream[2:] = [scenes.normal(*v.shape, seed=scenes.generator(i)).float() for i, v in enumerate(values[2:])]
+    back = [*args[:4], *args[5:10], *args[12:], radii, *upstream]
+    got = reference.project_backward(*back)
+    want = reference.project_backward(*(a.double() if isinstance(a, Tensor) and a.is_floating_point() else a for a in back))
+    z = values[1].double().clamp_min(cam.near)
+    norm = functools.partial(torch.linalg.vector_norm, dim=-1)
+    size = 2 * cam.Ks[:, 0, 0, None] / z * (2 * norm(values[2].double()) * norm(upstream[2].double()) + upstream[3].abs()) / math.sqrt(0.6)
+    bound = 50 * torch.finfo(torch.float32).eps * (size * foreshortening(splats, cam, values[2]).clamp_min(1.0)).nan_to_num(0.0).sum(0)
+    assert (norm(got.scales - want.scales) <= bound).all()
+    assert (norm(got.quats - want.quats) <= 4 * bound * splats.scales.amax(-1) / norm(splats.quats)).all()
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])

@@ -133,9 +133,8 @@ def covariance2d(M, F, HAS_COVARS: tl.constexpr):
 
 
 @triton.jit
-def compensation(det_sharp, det, FLOOR: tl.constexpr):
+def compensation(ratio, FLOOR: tl.constexpr):
     """Root of the ratio of the determinants, FLOOR at the least."""
-    ratio = det_sharp / det
     return tl.sqrt(tl.where(ratio > FLOOR * FLOOR, ratio, FLOOR * FLOOR))
 
 
@@ -177,7 +176,7 @@ def project_fwd_kernel(means, quats, scales, covars, opacities, viewmats, Ks, ra
     det = tl.where(valid, det, 1.0)
     scaling = tl.full((BLOCK,), 1.0, dt)
     if ANTIALIASED:
-        scaling = compensation(det_sharp, det, FLOOR)
+        scaling = compensation(det_sharp / det, FLOOR)
         opacity *= scaling
     # alpha reaches ALPHA_MIN at e standard deviations
     e = tl.sqrt(2.0 * tl.log(tl.where(opacity > ALPHA_MIN, opacity, ALPHA_MIN) / ALPHA_MIN))
@@ -280,7 +279,7 @@ def project_bwd_kernel(means, quats, scales, covars, viewmats, Ks, radii, v_mean
         if ANTIALIASED:
             ratio = det_sharp * inverse
             v_scaling = tl.load(v_compensations + row, mask=valid, other=0.0)
-            v_ratio = tl.where(ratio >= FLOOR * FLOOR, v_scaling / tl.sqrt(ratio), 0.0) * blur
+            v_ratio = tl.where(ratio >= FLOOR * FLOOR, v_scaling / compensation(ratio, FLOOR), 0.0) * blur
             G0 = combine(1.0, combine(1.0, G0, v_ratio * trace, X0), -v_ratio * ratio, T0)
             G1 = combine(1.0, combine(1.0, G1, v_ratio * trace, X1), -v_ratio * ratio, T1)
         G0 = where_valid(valid, G0)

@@ -94,7 +94,7 @@ def _view(means: Tensor, covars: Tensor, opacities: Tensor, viewmat: Tensor, K: 
 
     with torch.no_grad():
         seen = opacities[ahead] * compensations
-        extent = torch.clamp(torch.sqrt(2 * torch.log(torch.clamp(255 * seen, min=1.0))), max=3.33)
+        extent = torch.sqrt(2 * torch.log(torch.clamp(255 * seen, min=1.0)))
         radii = torch.ceil(extent[:, None] * torch.sqrt(torch.diagonal(blurred, dim1=1, dim2=2)))
         size = torch.tensor([width, height])
         kept = ((seen >= ALPHA_MIN) & (radii > 0).all(1) & (means2d + radii > 0).all(1)

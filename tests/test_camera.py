@@ -180,6 +180,10 @@ WRONG = [
     (ValueError, "got [1, 1, 4, 4] and [1, 1, 3, 3]", {"viewmats": EYE4[None, None], "Ks": EYE3[None, None]}),
     (ValueError, "camera.viewmats: expected finite numbers", {"viewmats": EYE4 * math.nan}),
     (ValueError, "camera.Ks: expected finite numbers", {"Ks": EYE3 / 0}),
+    *[(ValueError, "camera.Ks: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], as skew", {"Ks": EYE3 + entry})
+      for entry in torch.tensor([0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 1.0, 1.0, 1.0]).mul(2e-5).diag().view(9, 3, 3) if entry.any()],
+    (ValueError, "camera.Ks: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], as skew and other homographies are not supported; got [[[",
+     {"viewmats": EYE4.repeat(2, 1, 1), "Ks": torch.stack([EYE3, EYE3 + EYE3.flip(1)])}),
     (ValueError, "width: expected at least 1; got 0", {"width": 0}),
     (ValueError, "height: expected at least 1; got -3", {"height": -3}),
     (TypeError, "width: expected an int of at least 1; got 24.0", {"width": 24.0}),
@@ -192,9 +196,34 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("kind", "message", "changes"), WRONG, ids=[m[1][:50] for m in WRONG])
+@pytest.mark.parametrize(("kind", "message", "changes"), WRONG, ids=[f"{m[1][:40]} {i}" for i, m in enumerate(WRONG)])
 def test_errors_name_the_argument_what_came_and_what_is_expected(kind: type[Exception], message: str,
                                                                  changes: dict[str, object]) -> None:
     arguments = {"viewmats": EYE4, "Ks": EYE3, "width": 24, "height": 17} | changes
     with pytest.raises(kind, match=re.escape(message)):
         Camera(**arguments)
+
+
+def test_rounding_is_no_skew_and_what_requires_grad_may_be_perturbed() -> None:
+    K = torch.tensor([[1000.0, 0.009, 320.0], [-0.009, 1000.0, 240.0], [9e-6, -9e-6, 1 + 9e-6]])
+    Camera(EYE4, K, 640, 480)
+    skewed = K + torch.tensor([[0.0, 3.0, 0.0]] * 3)
+    Camera(EYE4, skewed.requires_grad_(), 640, 480)
+    with pytest.raises(ValueError, match=r"camera\.Ks"):
+        Camera(EYE4, skewed.detach(), 640, 480)
+
+
+@pytest.mark.parametrize("up", [(0.0, 0.0, 1.0), (0.0, 0.0, -3.0), (0.0, 1e-7, 1.0), (0.0, 0.0, 0.0), (0.0, math.nan, 1.0)])
+def test_look_at_refuses_to_take_up_along_the_view(up: tuple[float, float, float]) -> None:
+    with pytest.raises(ValueError, match=r"^up: expected a direction that is not along the view, \[0\.0, 0\.0, 1\.0\]; got \["):
+        Camera.look_at((1.0, 2.0, 3.0), (1.0, 2.0, 7.0), up, width=8, height=8)
+
+
+def test_look_at_takes_up_at_a_small_angle_to_the_view() -> None:
+    R = Camera.look_at((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), (0.0, -1e-5, 1.0), width=8, height=8, dtype=torch.float64).viewmats[:3, :3]
+    assert_close(R, torch.eye(3, dtype=torch.float64), 1e-15)
+
+
+def test_look_at_refuses_to_look_at_itself() -> None:
+    with pytest.raises(ValueError, match=r"^eye, target: expected two points; got \[1\.0, 2\.0, 3\.0\] and"):
+        Camera.look_at((1.0, 2.0, 3.0), (1.0, 2.0, 3.0), width=8, height=8)

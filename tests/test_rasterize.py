@@ -162,6 +162,16 @@ def test_meta_tells_what_was_drawn(backend: Backend) -> None:
     assert meta.hits.sum() <= 1.1 * hits.sum()
 
 
+@pytest.mark.parametrize("antialiased", [False, True])
+def test_opacities_above_1_are_as_the_formula_says_with_tiles_of_any_size(antialiased: bool) -> None:
+    """They reach further than 3.33 standard deviations."""
+    splats, cam = scenes.splats(40, spread=1.0, opacity=(1.0, 50.0)), scenes.camera(2, 40, 30)
+    want = plain.render(*splats, cam.viewmats, cam.Ks, 40, 30, antialiased=antialiased)
+    for tile in (1, 4, 16, 40):
+        got = rasterize(*splats, cam, tile=tile, antialiased=antialiased)
+        assert_close(got[:2], want[:2], 1e-11)
+
+
 def test_the_screen_gradient_is_that_of_means2d(backend: Backend) -> None:
     """By retain_grad on `meta.means2d`, and by the gradient of a zero offset, which compiled code can have, too."""
     splats, cam = backend.put((scenes.splats(40), scenes.camera(2)))

@@ -15,6 +15,10 @@ from tsplat.checks import check_number, check_size, check_tensor
 
 CameraModel = Literal["pinhole", "orthographic", "fisheye"]
 MODELS: tuple[CameraModel, ...] = ("pinhole", "orthographic", "fisheye")
+NO_SKEW = 1e-5
+"""What may be off in the entries of Ks that are not used, as if by rounding: a part of fx or fy, 0.01 pixel at 1000 from the centre."""
+PARALLEL = 1e-6
+"""Least angle in radians between the view and `up`."""
 
 
 @dataclass(frozen=True)
@@ -32,8 +36,9 @@ class Camera:
         near, far: splats whose depth (camera z) is outside `(near, far)` are culled.
 
     Raises:
-        ValueError, TypeError: naming the argument, what came and what is expected; also for matrices that are not finite (not checked on
-            a GPU, for which Python would have to wait, or while compiling).
+        ValueError, TypeError: naming the argument, what came and what is expected. What the matrices hold is not checked on a GPU, for
+            which Python would have to wait, or while compiling; otherwise, they must be finite, and Ks of the form above: skew is not
+            supported (not checked if Ks requires grad, where finite differences or an optimiser may move entries that are not used).
     """
 
     viewmats: Tensor
@@ -62,6 +67,9 @@ class Camera:
             for name, matrices in (("camera.viewmats", self.viewmats), ("camera.Ks", self.Ks)):
                 if not bool(matrices.isfinite().all()):
                     raise ValueError(f"{name}: expected finite numbers; got NaN or infinity in {matrices.tolist()}")
+            if not self.Ks.requires_grad and not all(map(_has_form, self.Ks.reshape(-1, 3, 3).tolist())):
+                raise ValueError("camera.Ks: expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], as skew and other homographies are not "
+                                 f"supported; got {self.Ks.tolist()}")
 
     @property
     def batched(self) -> bool:
@@ -90,13 +98,28 @@ class Camera:
             up: `[3]` world direction that is up in the image, not along the view. The default suits captures with y down.
             width, height: image size in pixels.
             fov: horizontal field of view in degrees.
+
+        Raises:
+            ValueError: if eye and target are equal, or up is along the view or zero (not checked while compiling).
         """
         eye, target, up = (torch.as_tensor(v, dtype=torch.float64) for v in (eye, target, up))
         forward = torch.nn.functional.normalize(target - eye, dim=0)
-        right = torch.nn.functional.normalize(torch.linalg.cross(forward, up), dim=0)
+        sideways = torch.linalg.cross(forward, torch.nn.functional.normalize(up, dim=0))
+        if not torch.compiler.is_compiling() and not bool(torch.linalg.vector_norm(sideways) > PARALLEL):
+            if not bool(torch.linalg.vector_norm(forward) > 0):
+                raise ValueError(f"eye, target: expected two points; got {eye.tolist()} and {target.tolist()}")
+            raise ValueError(f"up: expected a direction that is not along the view, {forward.tolist()}; got {up.tolist()}")
+        right = torch.nn.functional.normalize(sideways, dim=0)
         rotation = torch.stack([right, torch.linalg.cross(forward, right), forward])      # rows: x right, y down, z forward
         viewmat = torch.eye(4, dtype=torch.float64)
         viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ eye
         f = 0.5 * width / math.tan(math.radians(fov) / 2)
         K = torch.tensor([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]], dtype=torch.float64)
         return Camera(viewmat.to(dtype), K.to(dtype), width, height)
+
+
+def _has_form(K: list[list[float]]) -> bool:
+    """Whether K is [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]."""
+    (fx, skew, _), (shear, fy, _), (px, py, one) = K
+    off = skew / fx if fx else skew, shear / fy if fy else shear, px, py, one - 1
+    return max(map(abs, off)) <= NO_SKEW

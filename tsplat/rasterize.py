@@ -70,7 +70,7 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
         means: `[N, 3]`.
         quats: `[N, 4]` (w, x, y, z), normalised inside.
         scales: `[N, 3]` standard deviations along the axes. quats and scales are None if `covars` is given.
-        opacities: `[N]` in [0, 1].
+        opacities: `[N]`, in [0, 1] as a rule; above 1 a splat is opaque farther out (alpha = min(alpha_max, o exp(-sigma))).
         colors: `[N, D]` or `[C, N, D]`, any D from 1; or with `sh_degree` SH coefficients `[N, K, D]`, K >= (sh_degree + 1)^2, of which a
             colour max(SH + 0.5, 0) is made in each camera's direction.
         camera: one or a batch of C cameras.

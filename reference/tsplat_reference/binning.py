@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from tsplat_reference.constants import ALPHA_MIN, BIN_SLACK, BIN_SLACK_RELATIVE, EXTENT_MAX
+from tsplat_reference.constants import ALPHA_MIN, BIN_ROUNDING, BIN_SLACK, BIN_SLACK_RELATIVE, FLATTEST
 
 
 class Bins(NamedTuple):
@@ -26,7 +26,14 @@ def tile_counts(width: int, height: int, tile: int) -> tuple[int, int]:
 
 def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
                ) -> Bins:
-    """Hits of splats and tiles: a tile is hit if the ellipse alpha >= 1/255 touches the rectangle of its pixel centres.
+    """Hits of splats and tiles: a tile is hit only if the ellipse alpha >= 1/255 touches the rectangle of its pixel centres, and always
+    if one of these centres lies in it.
+
+    Both hold up to rounding, which may add a hit, but never lose one. The conic is taken as in `footprint`, a (dx + s dy)^2 + w dy^2, with
+    w = c - b^2/a lowered by more than its rounding error, 1.5 eps c (b^2/a is rounded twice, the slack and the difference once each),
+    and that of `footprint`, eps c: all that is left of w for a needle may be error. The rest is as if the pixel were elsewhere. Positions,
+    slope and edges are rounded about a dozen times, each time by at most eps/2 of |mean| + size in x or of what is that in x by the
+    slope from y; and a shift by d pixels is one by at most sqrt(a + c) d in the norm of the conic, of which `level` is the square.
 
     Args:
         means2d, radii, conics, depths: `[C, N, 2]`, `[C, N, 2]`, `[C, N, 3]`, `[C, N]`, as `project` gives them; radii 0 is culled.
@@ -39,19 +46,23 @@ def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor
     visible = visible[_sortable(depths.flatten()[visible]).sort(stable=True).indices]       # front to back
     mx, my = means2d.reshape(-1, 2)[visible].unbind(-1)
     a, b, c = conics.reshape(-1, 3)[visible].unbind(-1)
-    log_ratio = torch.log(opacities.flatten()[visible].clamp_min(ALPHA_MIN) / ALPHA_MIN)
-    level = (2 * log_ratio).clamp_max(EXTENT_MAX**2) * (1 + BIN_SLACK_RELATIVE) + BIN_SLACK         # a dx^2 + 2 b dx dy + c dy^2 <= level
-    det = torch.maximum(a * c - b * b, torch.finfo(a.dtype).eps * a * c)                    # rounding must not shrink it to 0
+    a, c, eps = a.clamp_min(FLATTEST), c.clamp_min(FLATTEST), torch.finfo(a.dtype).eps
+    s = b / a
+    w = (c * (1 - BIN_ROUNDING * eps) - b * s).clamp_min(FLATTEST)                          # a (dx + s dy)^2 + w dy^2: w must not be too large
+    distance = (2 * torch.log(opacities.flatten()[visible].clamp_min(ALPHA_MIN) / ALPHA_MIN)).sqrt()
+    distance = distance + 2 * BIN_ROUNDING * eps * (mx.abs() + my.abs() + (width + height)) * (a + c).sqrt()
+    level = distance * distance * (1 + BIN_SLACK_RELATIVE) + BIN_SLACK
 
-    half_height = (level * a / det).sqrt()
+    half_height = (level / w).sqrt()
+    rightmost = -s * (a / c).sqrt() * half_height                                           # dy of the ellipse's rightmost point
     row, last_row = _span(my - half_height, my + half_height, height, tile)
     strip, row = _enumerate(row, last_row)                                                  # [R] splat and tile row of each strip
-    mx, my, a, b, c, level, det, half_height = (v.index_select(0, strip) for v in (mx, my, a, b, c, level, det, half_height))
+    mx, my, s, reach, shrink, half_height, rightmost = (
+        v.index_select(0, strip) for v in (mx, my, s, level / a, w / a, half_height, rightmost))
     low = torch.maximum(row * tile + 0.5 - my, -half_height)                                # the strip's pixel centres, about the mean
     high = torch.minimum(((row + 1) * tile).clamp_max(height) - 0.5 - my, half_height)
-    rightmost = -(b / c) * (level * c / det).sqrt()                                         # dy of the ellipse's rightmost point
-    x_high = _edge(torch.minimum(torch.maximum(rightmost, low), high), a, b, det, level, 1.0)
-    x_low = _edge(torch.minimum(torch.maximum(-rightmost, low), high), a, b, det, level, -1.0)
+    x_high = _edge(torch.minimum(torch.maximum(rightmost, low), high), s, reach, shrink, 1.0)
+    x_low = _edge(torch.minimum(torch.maximum(-rightmost, low), high), s, reach, shrink, -1.0)
     column, last_column = _span(mx + x_low, mx + x_high, width, tile)
 
     hit, column = _enumerate(column, last_column)                                           # [M] strip and tile column of each hit
@@ -63,9 +74,9 @@ def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor
     return Bins(splat.to(torch.int32).index_select(0, hit.index_select(0, order)), offsets)
 
 
-def _edge(dy: Tensor, a: Tensor, b: Tensor, det: Tensor, level: Tensor, side: float) -> Tensor:
-    """Dx of the ellipse's right (side 1) or left (side -1) edge at height dy from its centre."""
-    return (-b * dy + side * (a * level - det * dy * dy).clamp_min(0.0).sqrt()) / a
+def _edge(dy: Tensor, s: Tensor, reach: Tensor, shrink: Tensor, side: float) -> Tensor:
+    """Dx of the ellipse's right (side 1) or left (side -1) edge at height dy from its centre: (dx + s dy)^2 = reach - shrink dy^2."""
+    return side * (reach - shrink * dy * dy).clamp_min(0.0).sqrt() - s * dy
 
 
 def _span(low: Tensor, high: Tensor, size: int, tile: int) -> tuple[Tensor, Tensor]:
@@ -88,7 +99,7 @@ def _sortable(depths: Tensor) -> Tensor:
     if depths.dtype not in (torch.float32, torch.float64):
         depths = depths.float()
     integer, bits = (torch.int32, 31) if depths.dtype == torch.float32 else (torch.int64, 63)
-    key = depths.contiguous().view(integer)
+    key = (depths + 0.0).view(integer)                                                      # -0.0 is 0.0
     return key ^ ((key >> bits) & torch.iinfo(integer).max)
 
 

@@ -12,12 +12,15 @@ TRANSMITTANCE_MIN = 1e-4
 EPS2D = 0.3
 """Added to the diagonal of the projected covariance, in pixels squared: the low-pass filter of EWA splatting."""
 
-EXTENT_MAX = 3.33
-"""Extent of a splat in standard deviations at the most: sqrt(2 ln 255), where an opaque splat falls to ALPHA_MIN."""
-
 BIN_SLACK = 1e-3
 """Added, with its relative twin, to the squared radius of the ellipse in tile tests: rounding may add a hit, but never lose one."""
 BIN_SLACK_RELATIVE = 1e-4
+
+BIN_ROUNDING = 4
+"""Slack of tile tests for rounding of the conic and, twice that, of positions, in units of eps: see `bin_splats`."""
+
+FLATTEST = 1e-30
+"""In tile tests, the least entry of a conic: a splat of 1e15 pixels, beyond which quotients might overflow float32."""
 
 FRUSTUM_MARGIN = 0.3
 """x/z and y/z in the pinhole Jacobian are clamped to the frustum widened by this part of its half size."""

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import functools
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from tsplat_reference.camera import Point, project_points, project_points_backward, split_intrinsics
-from tsplat_reference.constants import ALPHA_MIN, COMPENSATION_MIN, EXTENT_MAX, LARGEST
+from tsplat_reference.constants import ALPHA_MIN, COMPENSATION_MIN, LARGEST
 from tsplat_reference.parallel import map_chunks
-from tsplat_reference.planes import Matrix, Plane, Vector, dot, gram, join, matmul, split, total, transpose
+from tsplat_reference.planes import Matrix, Plane, Vector, cross, dot, join, matmul, split, total, transpose
 
 CHUNK = 1 << 14
 """Splats projected at a time where no graph is recorded, so that the planes (about 100 per camera) stay in the cache."""
@@ -41,21 +44,21 @@ def rotation_matrix(quat: Vector) -> Matrix:
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
     """Sigma = R S S^T R^T `[N, 3, 3]` (3DGS, equation 6) of quaternions `[N, 4]`, not zero, and scales `[N, 3]`."""
-    return torch.stack([join(row, quats[:, 0]) for row in _covariance(split(quats), split(scales))], -2)
+    F = _factor([*split(quats), *split(scales)])
+    return torch.stack([join(row, quats[:, 0]) for row in matmul(F, transpose(F))], -2)
 
 
-def _covariance(quat: Vector, scale: Vector) -> Matrix:
-    return gram([[r * s for r, s in zip(row, scale, strict=True)] for row in rotation_matrix(_normalise(quat)[0])])
+def _factor(shape: Sequence[Tensor]) -> Matrix:
+    """F = R S, so that Sigma = F F^T, of quaternion and scales."""
+    R = rotation_matrix(_normalise(shape[:4])[0])
+    return [[r * s for r, s in zip(row, shape[4:], strict=True)] for row in R]
 
 
-def _covariance_backward(quat: Vector, scale: Vector, v_covar: Matrix) -> tuple[list[Plane], list[Plane]]:
-    """Gradients with respect to the raw quaternions and the scales; `v_covar` is symmetric."""
-    unit, norm = _normalise(quat)
-    R = rotation_matrix(unit)
-    L = [[r * s for r, s in zip(row, scale, strict=True)] for row in R]
-    v_L = [[2 * v for v in row] for row in matmul(v_covar, L)]
-    v_scale = [dot(v, r) for v, r in zip(transpose(v_L), transpose(R), strict=True)]
-    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = [[v * s for v, s in zip(row, scale, strict=True)] for row in v_L]
+def _factor_backward(shape: Sequence[Tensor], v_F: Matrix) -> tuple[list[Plane], list[Plane]]:
+    """Gradients with respect to the raw quaternion and the scales."""
+    unit, norm = _normalise(shape[:4])
+    v_scale = [dot(v, r) for v, r in zip(transpose(v_F), transpose(rotation_matrix(unit)), strict=True)]
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = [[v * s for v, s in zip(row, shape[4:], strict=True)] for row in v_F]
     w, x, y, z = unit
     v_unit = [2 * (x * (r21 - r12) + y * (r02 - r20) + z * (r10 - r01)),
               2 * (-2 * x * (r11 + r22) + y * (r01 + r10) + z * (r02 + r20) + w * (r21 - r12)),
@@ -88,26 +91,28 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
             means[rows], _at(quats, rows), _at(scales, rows), _at(covars, rows), opacities[rows], viewmats, Ks, width, height, model, near,
             far, eps2d, antialiased), means.shape[0], CHUNK)
         return Projection(*(torch.cat(p, 1) for p in zip(*parts, strict=True)))
-    sane, means, quats, scales, covars = _sanitise(means, quats, scales, covars, opacities)
+    mean, shape = split(means), _shape(quats, scales, covars)
+    sane = _sane(mean, shape, opacities)
+    mean, shape = _or_harmless(sane, mean, shape)
     W = _rotation(viewmats)
-    p, valid = _in_range(_to_camera(split(means), W, viewmats), sane, model, near, far)
+    p, valid = _in_range(_to_camera(mean, W, viewmats), sane, model, near, far)
     u, v, J = project_points(p, split_intrinsics(Ks), width, height, model)
-    a0, b, c0 = _covariance2d(matmul(J, W), _world_covariance(quats, scales, covars))
-    a, c = a0 + eps2d, c0 + eps2d
-    det = a * c - b * b
-    valid = valid & (det > 0) & det.isfinite()
-    a0, b, c0, a, c, det = (torch.where(valid, v, 1.0) for v in (a0, b, c0, a, c, det))
-    ratio = (a0 * c0 - b * b) / det
+    _, a0, b, c0, det_sharp = _covariance2d(matmul(J, W), _matrix(shape), covars is None)
+    a, c, det = a0 + eps2d, c0 + eps2d, det_sharp + eps2d * (a0 + c0 + eps2d)
+    valid = valid & (det > 0) & (det < math.inf)
+    a, b, c, det = (torch.where(valid, v, 1.0) for v in (a, b, c, det))
 
-    compensations = ratio.clamp_min(COMPENSATION_MIN**2).sqrt() if antialiased else torch.ones_like(det)
+    compensations = torch.ones_like(det)
+    if antialiased:
+        compensations = (torch.where(valid, det_sharp, 1.0) / det).clamp_min(COMPENSATION_MIN**2).sqrt()
     rx, ry = _extents(a.detach(), c.detach(), opacities.detach() * compensations.detach())
     valid = valid & _on_screen(u.detach(), v.detach(), rx, ry, width, height)
     inverse = torch.where(valid, 1 / det, 0.0)
     return Projection(
-        torch.stack([torch.where(valid, rx, 0.0), torch.where(valid, ry, 0.0)], -1).to(torch.int32),
-        torch.stack([torch.where(valid, u, 0.0), torch.where(valid, v, 0.0)], -1),
+        join([torch.where(valid, rx, 0.0), torch.where(valid, ry, 0.0)], rx).to(torch.int32),
+        join([torch.where(valid, u, 0.0), torch.where(valid, v, 0.0)], u),
         torch.where(valid, p[2], 0.0),
-        torch.stack([c * inverse, -b * inverse, a * inverse], -1),
+        join([c * inverse, -b * inverse, a * inverse], det),
         torch.where(valid, compensations, 0.0))
 
 
@@ -135,57 +140,61 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
         return ProjectionGradients(torch.cat([p.means for p in parts]), _cat([p.quats for p in parts]), _cat([p.scales for p in parts]),
                                    _cat([p.covars for p in parts]), torch.stack([p.viewmats for p in parts]).sum(0),
                                    torch.stack([p.Ks for p in parts]).sum(0))
-    valid = (radii > 0).all(-1)                                                             # [C, N]
-    means, quats, scales, covars = _replace(valid.any(0), means, quats, scales, covars)
+    valid = (radii[..., 0] > 0) & (radii[..., 1] > 0)                                       # [C, N]
+    mean, shape = _or_harmless(valid.any(0), split(means), _shape(quats, scales, covars))
     W = _rotation(viewmats)
-    S = _world_covariance(quats, scales, covars)
-    p = _or_ahead(valid, _to_camera(split(means), W, viewmats))
+    p = _or_ahead(valid, _to_camera(mean, W, viewmats))
     intrinsics = split_intrinsics(Ks)
     _, _, J = project_points(p, intrinsics, width, height, model)
-    M = [[torch.where(valid, m, 0.0) for m in row] for row in matmul(J, W)]                 # a huge splat may overflow where it is culled
-    a0, b, c0 = _covariance2d(M, S)
-    a, c = a0 + eps2d, c0 + eps2d
-    det = torch.where(valid, a * c - b * b, 1.0)
+    M, F = matmul(J, W), _matrix(shape)
+    T, a0, b, c0, det_sharp = _covariance2d(M, F, covars is None)
+    trace = a0 + c0 + eps2d
+    a, c, det = a0 + eps2d, c0 + eps2d, det_sharp + eps2d * trace
 
-    # conic (A, B, C) = (c, -b, a)/det
-    v_A, v_B, v_C = (torch.where(valid, v, 0.0) for v in v_conics.unbind(-1))
+    # conic Q = (A, B, C) = (c, -b, a)/det, the inverse of Sigma': v_Sigma' = -Q v_Q Q, where B stands for both entries off the diagonal.
+    # What is needed is G = 2 v_Sigma' T, or 2 v_Sigma' M if Sigma is given, by way of X = adj(Sigma' before blur) T/det and Q T, not of
+    # v_Sigma', of which most cancels in the product with a long T
     inverse = 1 / det
-    v_det = (v_B * b - v_A * c - v_C * a) * inverse * inverse
-    v_a, v_b, v_c = v_C * inverse + v_det * c, -v_B * inverse - 2 * v_det * b, v_A * inverse + v_det * a
-    if antialiased and v_compensations is not None:
-        ratio = (a0 * c0 - b * b) * inverse
-        root = ratio.clamp_min(COMPENSATION_MIN**2).sqrt()
-        v_ratio = torch.where(valid & (ratio >= COMPENSATION_MIN**2), v_compensations / (2 * root), 0.0) * inverse
-        v_a, v_b, v_c = v_a + v_ratio * (c0 - ratio * c), v_b + v_ratio * 2 * b * (ratio - 1), v_c + v_ratio * (a0 - ratio * a)
+    blur = eps2d * inverse
+    v_A, v_B, v_C = v_conics.unbind(-1)
+    V, Q = [[-2 * v_A, -v_B], [-v_B, -2 * v_C]], [[c * inverse, -b * inverse], [-b * inverse, a * inverse]]
+    if covars is None:
+        normal = [n * inverse for n in cross(*T)]
+        X = [cross(T[1], normal), cross(normal, T[0])]
+    else:
+        T, X = M, matmul([[c0 * inverse, Q[0][1]], [Q[1][0], a0 * inverse]], M)
+    G = matmul(Q, matmul(V, _combine(X, blur, T)))
+    if antialiased and v_compensations is not None:     # ratio = det_sharp/(det_sharp + eps2d trace)
+        ratio = det_sharp * inverse
+        v_ratio = torch.where(ratio >= COMPENSATION_MIN**2, v_compensations / ratio.sqrt(), 0.0) * blur
+        G = _combine(_combine(G, v_ratio * trace, X), -v_ratio * ratio, T)
+    G = [[torch.where(valid, g, 0.0) for g in row] for row in G]
 
-    # Sigma' = M Sigma M^T, M = J W
-    VM = matmul([[v_a, 0.5 * v_b], [0.5 * v_b, v_c]], M)
-    v_S = [[torch.as_tensor(v).sum(0) for v in row] for row in matmul(transpose(M), VM)]
-    v_M = [[2 * v for v in row] for row in matmul(VM, S)]
+    # Sigma' = T T^T, T = M F; or M Sigma M^T
+    v_F = [[torch.as_tensor(v).sum(0) for v in row] for row in matmul(transpose(M), G)]
+    v_M = matmul(G, transpose(F))
+
+    # M = J W
     v_W = matmul(transpose(J), v_M)
     v_u, v_v = (torch.where(valid, v, 0.0) for v in v_means2d.unbind(-1))
-    v_p, v_Ks = project_points_backward(p, intrinsics, width, height, model, v_u, v_v, matmul(v_M, transpose(W)))
-    zero = det.new_zeros(())                            # of the right dtype, as v_p[2] may be the number 0.0
-    v_x, v_y, v_z = (torch.where(valid, v, zero) for v in (*v_p[:2], v_p[2] if v_depths is None else v_p[2] + v_depths))
+    (v_x, v_y, v_z), v_Ks = project_points_backward(p, intrinsics, width, height, model, v_u, v_v, matmul(v_M, transpose(W)))
+    v_p = [torch.as_tensor(v, dtype=det.dtype) for v in (v_x, v_y, v_z)]
+    if v_depths is not None:
+        v_p[2] = v_p[2] + torch.where(valid, v_depths, 0.0)
+    v_p = [v.expand_as(det) for v in v_p]
 
     # p = W mean + t
     v_viewmats, v_Ks = (torch.zeros_like(viewmats), v_Ks) if cameras else (viewmats.new_empty(0, 4, 4), Ks.new_empty(0, 3, 3))
-    for i, v in enumerate((v_x, v_y, v_z) if cameras else ()):
+    for i, v in enumerate(v_p if cameras else ()):
         for j in range(3):
-            v_viewmats[:, i, j] = total(v_W[i][j], det) + v @ means[:, j]
+            v_viewmats[:, i, j] = total(v_W[i][j], det) + v @ mean[j]
         v_viewmats[:, i, 3] = v.sum(1)
-    v_means = join([torch.as_tensor(dot(column, (v_x, v_y, v_z))).sum(0) for column in transpose(W)], means[:, 0])
+    v_means = join([torch.as_tensor(dot(column, v_p)).sum(0) for column in transpose(W)], mean[0])
     if covars is not None:
-        return ProjectionGradients(v_means, None, None, torch.stack([join(row, means[:, 0]) for row in v_S], -2), v_viewmats, v_Ks)
-    quats, scales = _given(quats, scales)
-    v_quats, v_scales = _covariance_backward(split(quats), split(scales), v_S)
-    return ProjectionGradients(v_means, join(v_quats, means[:, 0]), join(v_scales, means[:, 0]), None, v_viewmats, v_Ks)
-
-
-def _given(quats: Tensor | None, scales: Tensor | None) -> tuple[Tensor, Tensor]:
-    if quats is None or scales is None:
-        raise ValueError("quats, scales: expected both, or covars instead; got None")
-    return quats, scales
+        v_covars = join([0.5 * v for row in v_F for v in row], mean[0]).view(-1, 3, 3)
+        return ProjectionGradients(v_means, None, None, v_covars, v_viewmats, v_Ks)
+    v_quat, v_scale = _factor_backward(shape, v_F)
+    return ProjectionGradients(v_means, join(v_quat, mean[0]), join(v_scale, mean[0]), None, v_viewmats, v_Ks)
 
 
 def _at(tensor: Tensor | None, rows: slice) -> Tensor | None:
@@ -197,28 +206,38 @@ def _cat(parts: list[Tensor | None]) -> Tensor | None:
     return torch.cat(present) if present else None
 
 
-def _replace(keep: Tensor, means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None
-             ) -> tuple[Tensor, Tensor | None, Tensor | None, Tensor | None]:
-    """Put harmless numbers in place of splats that are not kept, so that nothing of them (NaN, say) reaches a sum over splats."""
-    rows = keep[:, None]
-    means = torch.where(rows, means, 0.0)
+def _shape(quats: Tensor | None, scales: Tensor | None, covars: Tensor | None) -> list[Tensor]:
+    """Planes: of quaternion and scales (7), or of Sigma row by row (9)."""
     if covars is not None:
-        return means, None, None, torch.where(rows[..., None], covars, torch.eye(3, dtype=covars.dtype, device=covars.device))
-    quats, scales = _given(quats, scales)
-    return means, torch.where(rows, quats, quats.new_tensor([1.0, 0.0, 0.0, 0.0])), torch.where(rows, scales, 1.0), None
+        return split(covars.flatten(-2))
+    if quats is None or scales is None:
+        raise ValueError("quats, scales: expected both, or covars instead; got None")
+    return split(quats) + split(scales)
 
 
-def _sanitise(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor
-              ) -> tuple[Tensor, Tensor, Tensor | None, Tensor | None, Tensor | None]:
-    """Which splats are sane `[N]`, and the inputs with the others replaced: finite, not huge, a rotation, an extent."""
-    sane = (means.abs() < LARGEST).all(-1) & opacities.isfinite()                           # false for NaN, too
-    if covars is not None:
-        sane = sane & (covars.abs() < LARGEST**2).all(-1).all(-1) & (covars.diagonal(dim1=-2, dim2=-1).amax(-1) > 0)
-    else:
-        quats, scales = _given(quats, scales)
-        sane = sane & (quats.abs() < LARGEST).all(-1) & ((quats * quats).sum(-1) > 0)
-        sane = sane & (scales.abs() < LARGEST).all(-1) & (scales.abs().amax(-1) > 0)
-    return sane, *_replace(sane, means, quats, scales, covars)
+def _matrix(shape: Sequence[Tensor]) -> Matrix:
+    """F = R S, so that Sigma = F F^T; or Sigma itself."""
+    return [shape[i:i + 3] for i in (0, 3, 6)] if len(shape) == 9 else _factor(shape)
+
+
+def _or_harmless(keep: Tensor, mean: Sequence[Tensor], shape: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
+    """Harmless numbers in place of splats that are not kept, so that nothing of them (NaN, say) reaches a sum over splats."""
+    harmless = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0) if len(shape) == 9 else (1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
+    return [torch.where(keep, v, 0.0) for v in mean], [torch.where(keep, v, h) for v, h in zip(shape, harmless, strict=True)]
+
+
+def _sane(mean: Sequence[Tensor], shape: Sequence[Tensor], opacities: Tensor) -> Tensor:
+    """Which splats are finite, not huge, and have a rotation and an extent `[N]`."""
+    sane = (_largest(mean) < LARGEST) & (opacities.abs() < math.inf)                        # false for NaN, too
+    if len(shape) == 9:
+        return sane & (_largest(shape) < LARGEST**2) & (torch.maximum(torch.maximum(shape[0], shape[4]), shape[8]) > 0)
+    quat, extent = shape[:4], _largest(shape[4:])
+    return sane & (_largest(quat) < LARGEST) & (torch.as_tensor(dot(quat, quat)) > 0) & (extent < LARGEST) & (extent > 0)
+
+
+def _largest(planes: Sequence[Tensor]) -> Tensor:
+    """The largest magnitude, NaN if one is."""
+    return functools.reduce(torch.maximum, [p.abs() for p in planes])
 
 
 def _rotation(viewmats: Tensor) -> Matrix:
@@ -244,25 +263,30 @@ def _in_range(p: Point, sane: Tensor, model: str, near: float, far: float) -> tu
     return _or_ahead(valid, p), valid
 
 
-def _world_covariance(quats: Tensor | None, scales: Tensor | None, covars: Tensor | None) -> Matrix:
-    if covars is not None:
-        return [split(row) for row in covars.unbind(-2)]
-    quats, scales = _given(quats, scales)
-    return _covariance(split(quats), split(scales))
+def _covariance2d(M: Matrix, F: Matrix, factored: bool) -> tuple[list[list[Plane]], Tensor, Tensor, Tensor, Tensor]:
+    """T = M F, and of Sigma' = M Sigma M^T (3DGS, equation 5), without blur, the entries xx, xy, yy and the determinant `[C, N]`.
+
+    With Sigma = F F^T, Sigma' = T T^T, whose determinant is |T0 x T1|^2: exact to rounding for needles, where xx yy - xy^2 cancels.
+    """
+    T = matmul(M, F)
+    (x0, x1), (y0, y1) = (T, T) if factored else (T, M)
+    a, b, c = (torch.as_tensor(dot(x, y)) for x, y in ((x0, y0), (x0, y1), (x1, y1)))
+    if not factored:
+        return T, a, b, c, a * c - b * b
+    normal = cross(*T)
+    return T, a, b, c, torch.as_tensor(dot(normal, normal))
 
 
-def _covariance2d(M: Matrix, S: Matrix) -> tuple[Tensor, Tensor, Tensor]:
-    """The entries xx, xy, yy `[C, N]` of M Sigma M^T (3DGS, equation 5)."""
-    MS = matmul(M, S)
-    a, b, c = dot(MS[0], M[0]), dot(MS[0], M[1]), dot(MS[1], M[1])
-    return torch.as_tensor(a), torch.as_tensor(b), torch.as_tensor(c)
+def _combine(A: Matrix, b: Tensor, B: Matrix) -> list[list[Plane]]:
+    """A + b B."""
+    return [[x + b * y for x, y in zip(*rows, strict=True)] for rows in zip(A, B, strict=True)]
 
 
 def _extents(a: Tensor, c: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
-    """Half sizes of the box in which alpha can reach ALPHA_MIN: ceil(e sigma), e = min(3.33, sqrt(2 ln(255 o)))."""
-    e = (2 * torch.log(opacities.clamp_min(ALPHA_MIN) / ALPHA_MIN)).sqrt().clamp_max(EXTENT_MAX)
+    """Half sizes of the box in which alpha can reach ALPHA_MIN: ceil(e sigma), e = sqrt(2 ln(255 o)), which is 3.33 for an opaque splat."""
+    e = (2 * torch.log(opacities.clamp_min(ALPHA_MIN) / ALPHA_MIN)).sqrt()
     e = torch.where(opacities >= ALPHA_MIN, e, 0.0)
-    rx, ry = ((e * v.clamp(0.0, 1e18).sqrt()).ceil().nan_to_num(0.0).clamp_max(2.0**30) for v in (a, c))
+    rx, ry = ((e * v.clamp(0.0, 1e18).sqrt()).ceil().clamp_max(2.0**30) for v in (a, c))
     return rx, ry
 
 

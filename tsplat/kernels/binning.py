@@ -1,30 +1,35 @@
-"""Tile intersection in depth order, on two levels: a radix sort of the few hits of splats and bins of 8 x 8 tiles, then each tile picks its
-own from the list of its bin, by counting.
+"""Tile intersection in depth order, on two levels: a radix sort of the few hits of splats and bins of 8 x 8 tiles, by bin and depth, then each
+tile picks its own from the list of its bin, by counting.
 
-A thread per splat counts and writes its hits of bins. Each of these gets 8 bytes, a bit per tile of the bin, and a program per tile counts and
-then copies the splats that have its bit. Against sorting the hits of tiles, of which there are 4 times as many, that saves most of the
-memory (torch's sort takes 8 bytes of index per key, twice) and of its traffic.
+A thread per splat counts and writes its hits of bins. Each of these gets 8 bytes, a bit per tile of the bin, and a program per row of tiles
+counts and then copies the splats that have its bits. Against sorting the hits of tiles, of which there are 5 times as many, that saves most
+of the memory (torch's sort takes 8 bytes of index per key, twice) and of its traffic.
 """
 
 from __future__ import annotations
-
-import math
 
 import torch
 import triton
 import triton.language as tl
 from torch import Tensor
-from tsplat_reference.constants import ALPHA_MIN, BIN_SLACK, BIN_SLACK_RELATIVE, EXTENT_MAX
+from tsplat_reference.constants import ALPHA_MIN, BIN_ROUNDING, BIN_SLACK, BIN_SLACK_RELATIVE, FLATTEST
 
 from tsplat.kernels.footprint import TILE
 from tsplat.kernels.launch import Launcher, ceil_div, launch
 
 SIDE = tl.constexpr(8)
 """Tiles along the side of a bin: a row of them is a byte."""
-LOG_MIN = tl.constexpr(math.log(ALPHA_MIN))
-LEVEL_MAX = tl.constexpr(EXTENT_MAX**2)
+LEAST = tl.constexpr(ALPHA_MIN)
 SLACK = tl.constexpr(BIN_SLACK)
 SLACK_RELATIVE = tl.constexpr(BIN_SLACK_RELATIVE)
+ROUNDING = tl.constexpr(BIN_ROUNDING)
+FLAT = tl.constexpr(FLATTEST)
+
+
+@triton.jit
+def visible(radii, splat, real):
+    """Whether splats were not culled."""
+    return real & (tl.load(radii + 2 * splat, mask=real, other=0) > 0) & (tl.load(radii + 2 * splat + 1, mask=real, other=0) > 0)
 
 
 @triton.jit
@@ -36,26 +41,26 @@ def span(low, high, size, TILE: tl.constexpr):
 
 
 @triton.jit
-def visible(radii, splat, real):
-    """Whether splats were not culled."""
-    return real & (tl.load(radii + 2 * splat, mask=real, other=0) > 0) & (tl.load(radii + 2 * splat + 1, mask=real, other=0) > 0)
-
-
-@triton.jit
-def ellipse(means2d, conics, opacities, splat, real, H, EPS: tl.constexpr):
-    """The ellipse a dx^2 + 2 b dx dy + c dy^2 = level in which alpha reaches 1/255, with a slack for rounding."""
+def ellipse(means2d, conics, opacities, splat, real, W, H, EPS: tl.constexpr):
+    """Where alpha reaches 1/255, with a slack for rounding (see `tsplat_reference.bin_splats`): centre, slope, squared reach in x, by how much
+    that shrinks with dy^2, half the height, and dy of the rightmost point."""
     mx = tl.load(means2d + 2 * splat, mask=real, other=0.0)
     my = tl.load(means2d + 2 * splat + 1, mask=real, other=0.0)
     a = tl.load(conics + 3 * splat, mask=real, other=1.0)
     b = tl.load(conics + 3 * splat + 1, mask=real, other=0.0)
     c = tl.load(conics + 3 * splat + 2, mask=real, other=1.0)
     opacity = tl.load(opacities + splat, mask=real, other=1.0)
-    dt: tl.constexpr = mx.dtype
-    level = 2.0 * (tl.log(opacity) - tl.full((), LOG_MIN, dt))
-    level = tl.minimum(tl.maximum(level, 0.0), tl.full((), LEVEL_MAX, dt)) * (1.0 + SLACK_RELATIVE) + SLACK
-    det = tl.maximum(a * c - b * b, EPS * a * c)
-    half = tl.sqrt(level * a / det)
-    return mx, my, a, b, c, level, det, half
+    least = tl.full((), LEAST, mx.dtype)                # literals would be rounded to float32
+    flat = tl.full((), FLAT, mx.dtype)
+    a = tl.maximum(a, flat)
+    c = tl.maximum(c, flat)
+    s = b / a
+    w = tl.maximum(c * tl.full((), 1.0 - ROUNDING * EPS, mx.dtype) - b * s, flat)
+    distance = tl.sqrt(2.0 * tl.log(tl.maximum(opacity, least) / least))
+    distance += tl.full((), 2.0 * ROUNDING * EPS, mx.dtype) * (tl.abs(mx) + tl.abs(my) + (W + H).to(mx.dtype)) * tl.sqrt(a + c)
+    level = distance * distance * tl.full((), 1.0 + SLACK_RELATIVE, mx.dtype) + tl.full((), SLACK, mx.dtype)
+    half = tl.sqrt(level / w)
+    return mx, my, s, level / a, w / a, half, -s * tl.sqrt(a / c) * half
 
 
 @triton.jit
@@ -66,25 +71,24 @@ def rows(my, half, real, H, TILE: tl.constexpr):
 
 
 @triton.jit
-def row_span(row, mx, my, a, b, c, level, det, half, W, H, TILE: tl.constexpr):
+def row_span(row, mx, my, s, reach, shrink, half, rightmost, W, H, TILE: tl.constexpr):
     """First and last tile of a row of tiles that the ellipse touches, where its pixel centres are."""
     low = tl.maximum((row * TILE).to(mx.dtype) + 0.5 - my, -half)
     high = tl.minimum(tl.minimum((row + 1) * TILE, H).to(mx.dtype) - 0.5 - my, half)
-    rightmost = -(b / c) * tl.sqrt(level * c / det)
     y = tl.minimum(tl.maximum(rightmost, low), high)
-    x_high = (-b * y + tl.sqrt(tl.maximum(a * level - det * y * y, 0.0))) / a
+    x_high = tl.sqrt(tl.maximum(reach - shrink * y * y, 0.0)) - s * y
     y = tl.minimum(tl.maximum(-rightmost, low), high)
-    x_low = (-b * y - tl.sqrt(tl.maximum(a * level - det * y * y, 0.0))) / a
+    x_low = -tl.sqrt(tl.maximum(reach - shrink * y * y, 0.0)) - s * y
     return span(mx + x_low, mx + x_high, W, TILE)
 
 
 @triton.jit
-def count_hits(mx, my, a, b, c, level, det, half, real, W, H, TILE: tl.constexpr):
+def count_hits(mx, my, s, reach, shrink, half, rightmost, real, W, H, TILE: tl.constexpr):
     """Number of tiles that each splat hits."""
     row, last = rows(my, half, real, H, TILE)
     count = row * 0
     while tl.max((row <= last).to(tl.int32), 0) > 0:
-        left, right = row_span(row, mx, my, a, b, c, level, det, half, W, H, TILE)
+        left, right = row_span(row, mx, my, s, reach, shrink, half, rightmost, W, H, TILE)
         count += tl.where(row <= last, tl.maximum(right - left + 1, 0), 0)
         row += 1
     return count
@@ -97,34 +101,37 @@ def count_kernel(radii, means2d, conics, opacities, counts, totals, R, W, H, EPS
     """Number of bins that each splat hits, counts `[R]`, and of bins and of tiles that all do, added to totals `[2]`."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     real = visible(radii, i, i < R)
-    mx, my, a, b, c, level, det, half = ellipse(means2d, conics, opacities, i, real, H, EPS)
-    bins = count_hits(mx, my, a, b, c, level, det, half, real, W, H, TILE * SIDE)
+    mx, my, s, reach, shrink, half, rightmost = ellipse(means2d, conics, opacities, i, real, W, H, EPS)
+    bins = count_hits(mx, my, s, reach, shrink, half, rightmost, real, W, H, TILE * SIDE)
     tl.store(counts + i, bins, mask=i < R)
-    tiles = count_hits(mx, my, a, b, c, level, det, half, real, W, H, TILE)
+    tiles = count_hits(mx, my, s, reach, shrink, half, rightmost, real, W, H, TILE)
     tl.atomic_add(totals, tl.sum(bins.to(tl.int64), 0), sem="relaxed")
     tl.atomic_add(totals + 1, tl.sum(tiles.to(tl.int64), 0), sem="relaxed")
 
 
 @Launcher
 @triton.jit(do_not_specialize=["R", "N", "W", "H", "bins_x", "bins_y", "capacity"])
-def emit_kernel(order, radii, means2d, conics, opacities, counts, ends, keys, ids, R, N, W, H, bins_x, bins_y, capacity,
+def emit_kernel(radii, means2d, conics, opacities, depth_keys, counts, ends, keys, ids, R, N, W, H, bins_x, bins_y, capacity,
                 EPS: tl.constexpr, TILE: tl.constexpr, SIDE: tl.constexpr, BLOCK: tl.constexpr):
-    """Bin and splat of each hit of bins, splat after splat; hits beyond the capacity are not written."""
+    """Key and splat of each hit of bins, splat after splat; hits beyond the capacity are not written. A key is the bin, then the depth: the
+    bits of a float, made to sort as an integer."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    splat = tl.load(order + i, mask=i < R, other=0)
-    real = visible(radii, splat, i < R)
-    mx, my, a, b, c, level, det, half = ellipse(means2d, conics, opacities, splat, real, H, EPS)
+    real = visible(radii, i, i < R)
+    mx, my, s, reach, shrink, half, rightmost = ellipse(means2d, conics, opacities, i, real, W, H, EPS)
     row, last = rows(my, half, real, H, TILE * SIDE)
     at = tl.load(ends + i, mask=i < R, other=0) - tl.load(counts + i, mask=i < R, other=0)
+    bits = tl.load(depth_keys + i, mask=real, other=0)
+    bits = tl.where(bits == -2147483648, 0, bits)       # -0.0
+    depth = (bits ^ ((bits >> 31) & 0x7fffffff)).to(tl.int64) + 2147483648
     while tl.max((row <= last).to(tl.int32), 0) > 0:
-        left, right = row_span(row, mx, my, a, b, c, level, det, half, W, H, TILE * SIDE)
+        left, right = row_span(row, mx, my, s, reach, shrink, half, rightmost, W, H, TILE * SIDE)
         right = tl.where(row <= last, right, left - 1)
-        base = (splat // N * bins_y + row) * bins_x
+        base = (i // N * bins_y + row) * bins_x
         column = left
         while tl.max((column <= right).to(tl.int32), 0) > 0:
             mask = (column <= right) & (at < capacity)
-            tl.store(keys + at, (base + column).to(keys.dtype.element_ty), mask=mask)
-            tl.store(ids + at, splat.to(tl.int32), mask=mask)
+            tl.store(keys + at, ((base + column) << 32) + depth, mask=mask)
+            tl.store(ids + at, i.to(tl.int32), mask=mask)
             at += (column <= right).to(tl.int64)
             column += 1
         row += 1
@@ -132,20 +139,26 @@ def emit_kernel(order, radii, means2d, conics, opacities, counts, ends, keys, id
 
 @Launcher
 @triton.jit(do_not_specialize=["M", "bins", "bins_x", "bins_y", "W", "H"])
-def mask_kernel(keys, by_bin, ids, means2d, conics, opacities, sorted_ids, masks, M, bins, bins_x, bins_y, W, H, EPS: tl.constexpr,
+def mask_kernel(keys, by_key, ids, means2d, conics, opacities, edges, sorted_ids, masks, M, bins, bins_x, bins_y, W, H, EPS: tl.constexpr,
                 TILE: tl.constexpr, SIDE: tl.constexpr, BLOCK: tl.constexpr):
-    """Which tiles of the bin a splat hits: masks `[SIDE, M]`, a bit per tile of a row. Room beyond the hits has bin `bins`."""
+    """Where the list of each bin begins: edges `[bins + 1]`; and which tiles of the bin a splat hits: masks `[SIDE, M]`, a bit per tile of a
+    row. Room beyond the hits has bin `bins`."""
     j = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    bin = tl.load(keys + j, mask=j < M, other=bins).to(tl.int64)
+    bin = tl.where(j < M, tl.load(keys + j, mask=j < M, other=0) >> 32, bins)
+    new = tl.where(j > 0, tl.load(keys + j - 1, mask=(j > 0) & (j <= M), other=0) >> 32, -1) + 1       # bins that begin here: most often none
+    new = tl.where(j <= M, new, bin + 1)
+    while tl.max((new <= bin).to(tl.int32), 0) > 0:
+        tl.store(edges + new, j, mask=new <= bin)
+        new += 1
     real = bin < bins
-    splat = tl.load(ids + tl.load(by_bin + j, mask=real, other=0), mask=real, other=0)
+    splat = tl.load(ids + tl.load(by_key + j, mask=real, other=0), mask=real, other=0)
     tl.store(sorted_ids + j, splat, mask=real)
-    mx, my, a, b, c, level, det, half = ellipse(means2d, conics, opacities, splat.to(tl.int64), real, H, EPS)
+    mx, my, s, reach, shrink, half, rightmost = ellipse(means2d, conics, opacities, splat.to(tl.int64), real, W, H, EPS)
     first, last = rows(my, half, real, H, TILE)
     low = (bin % bins_x).to(tl.int32) * SIDE
     row = (bin // bins_x % bins_y).to(tl.int32) * SIDE
     for r in tl.static_range(SIDE):
-        left, right = row_span(row, mx, my, a, b, c, level, det, half, W, H, TILE)
+        left, right = row_span(row, mx, my, s, reach, shrink, half, rightmost, W, H, TILE)
         left = tl.maximum(left - low, 0)
         right = tl.minimum(right - low, SIDE - 1)
         hit = (row >= first) & (row <= last) & (left <= right)
@@ -192,8 +205,8 @@ def pick_kernel(edges, sorted_ids, masks, offsets, counts, ids, M, bins_x, bins_
 def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
                ) -> tuple[Tensor, Tensor]:
     """Launcher; see `tsplat_reference.bin_splats`. One host sync, for the number of hits."""
-    splats = _Splats(means2d, radii, conics, opacities, depths, width, height, tile)
-    return splats.lists(*splats.totals.tolist())
+    splats = _Splats(means2d, radii, conics, opacities, width, height, tile)
+    return splats.lists(depths, *splats.totals.tolist())
 
 
 def bin_splats_fixed(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int,
@@ -204,31 +217,31 @@ def bin_splats_fixed(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: 
         ids `[capacity]`, of which the first offsets[-1] count; offsets; and the capacity that was needed, int64 `[]` on the device. If
         that is more than `capacity`, hits are missing, and tiles at the end may have none: bin again with more.
     """
-    splats = _Splats(means2d, radii, conics, opacities, depths, width, height, tile)
-    ids, offsets = splats.lists(capacity, capacity)
+    splats = _Splats(means2d, radii, conics, opacities, width, height, tile)
+    ids, offsets = splats.lists(depths, capacity, capacity)
     return ids, offsets.clamp_(max=capacity), splats.totals.amax()
 
 
 class _Splats:
     """Splats with their hits of bins and of tiles counted."""
 
-    def __init__(self, means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
-                 ) -> None:
+    def __init__(self, means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, width: int, height: int, tile: int) -> None:
         if tile != TILE.value:
             raise ValueError(f"tile: expected {TILE.value}, the tile of the Triton kernels; got {tile}")
         (self.C, self.N), self.R = opacities.shape, opacities.numel()
         self.size, self.tiles = (width, height), (ceil_div(width, tile), ceil_div(height, tile))
-        self.bins = ceil_div(self.tiles[0], SIDE.value), ceil_div(self.tiles[1], SIDE.value)
-        self.radii, self.shapes = radii.contiguous(), (means2d.contiguous(), conics.contiguous(), opacities.contiguous())
+        self.bins = ceil_div(self.tiles[0], int(SIDE.value)), ceil_div(self.tiles[1], int(SIDE.value))
+        self.shapes = means2d.contiguous(), conics.contiguous(), opacities.contiguous()
+        self.radii = radii.contiguous()
         self.options = {"EPS": torch.finfo(means2d.dtype).eps, "TILE": tile, "SIDE": SIDE.value, **launch("bin"), "enable_fp_fusion": True}
-        self.programs = ceil_div(self.R, self.options["BLOCK"])
+        self.programs = ceil_div(self.R, launch("bin")["BLOCK"])
         self.counts = torch.empty(self.R, dtype=torch.int32, device=means2d.device)
         self.totals = torch.zeros(2, dtype=torch.int64, device=means2d.device)
         if self.R:
             count_kernel[(self.programs,)](self.radii, *self.shapes, self.counts, self.totals, self.R, *self.size, **self.options)
-        self.depth_order = depths.flatten().sort(stable=True).indices                       # a radix sort of 4 passes
+        self.ends = self.counts.cumsum(0)                                       # int64: more than 2^31 hits are counted right
 
-    def lists(self, coarse: int, fine: int) -> tuple[Tensor, Tensor]:
+    def lists(self, depths: Tensor, coarse: int, fine: int) -> tuple[Tensor, Tensor]:
         """Ids and offsets, with room for so many hits of bins and of tiles; hits beyond are left out."""
         device, bins = self.counts.device, self.C * self.bins[0] * self.bins[1]
         tile_counts = torch.empty(self.C * self.tiles[0] * self.tiles[1] + 1, dtype=torch.int32, device=device)
@@ -236,22 +249,27 @@ class _Splats:
         ids = torch.zeros(fine, dtype=torch.int32, device=device)
         if not (self.R and coarse):
             return ids, tile_counts.zero_().to(torch.int64)
-        counts = self.counts.index_select(0, self.depth_order)
-        ends = counts.cumsum(0)                                                             # int64: more than 2^31 hits are counted right
-        narrow = next(d for d in (torch.int16, torch.int32, torch.int64) if bins <= torch.iinfo(d).max)
-        keys = torch.full((coarse,), bins, dtype=narrow, device=device)                     # what is not overwritten is room beyond the hits
+        keys = torch.full((coarse,), bins << 32, dtype=torch.int64, device=device)      # what is not overwritten is room beyond the hits
         unsorted = torch.empty(coarse, dtype=torch.int32, device=device)
-        emit_kernel[(self.programs,)](self.depth_order, self.radii, *self.shapes, counts, ends, keys, unsorted, self.R, self.N,
+        emit_kernel[(self.programs,)](self.radii, *self.shapes, _depth_keys(depths), self.counts, self.ends, keys, unsorted, self.R, self.N,
                                       *self.size, *self.bins, coarse, **self.options)
-        keys, by_bin = keys.sort(stable=True)                                               # int16 keys: 2 passes
-        edges = torch.searchsorted(keys, torch.arange(bins + 1, device=device, dtype=narrow))
+        keys, by_key = keys.sort(stable=True)
+        edges = torch.empty(bins + 1, dtype=torch.int64, device=device)
         sorted_ids, masks = torch.empty_like(unsorted), torch.empty(SIDE.value, coarse, dtype=torch.uint8, device=device)
-        mask_kernel[(ceil_div(coarse, self.options["BLOCK"]),)](keys, by_bin, unsorted, *self.shapes, sorted_ids, masks, coarse, bins,
-                                                                *self.bins, *self.size, **self.options)
-        del unsorted, by_bin, keys, counts, ends
+        mask_kernel[(ceil_div(coarse + 1, launch("bin")["BLOCK"]),)](keys, by_key, unsorted, *self.shapes, edges, sorted_ids, masks, coarse,
+                                                                     bins, *self.bins, *self.size, **self.options)
+        del unsorted, by_key, keys
         grid, options = (bins, SIDE.value), {"SIDE": SIDE.value, **launch("pick")}
         lists = edges, sorted_ids, masks
         pick_kernel[grid](*lists, tile_counts, tile_counts, ids, coarse, *self.bins, *self.tiles, fine, WRITE=False, **options)
         offsets = tile_counts.cumsum(0)
         pick_kernel[grid](*lists, offsets, tile_counts, ids, coarse, *self.bins, *self.tiles, fine, WRITE=True, **options)
         return ids, offsets
+
+
+def _depth_keys(depths: Tensor) -> Tensor:
+    """32 bits that sort as the depths do: those of a float32, or else the ranks."""
+    if depths.dtype == torch.float32:
+        return depths.contiguous().view(torch.int32)
+    order = (depths.flatten() + 0.0).sort(stable=True).indices
+    return torch.empty_like(order, dtype=torch.int32).index_copy_(0, order, torch.arange(len(order), dtype=torch.int32, device=order.device))

@@ -1,8 +1,7 @@
 """Projection of Gaussians to 2D splats: a thread per pair of camera and splat; its backward: a thread per splat, a loop over the cameras.
 
-The twin of `tsplat_reference.projection`, better conditioned in three places, which tells in float32. A covariance given as quaternion and
-scales is never formed: with F = R S, Sigma' = T T^T for T = J W F. Its determinant is then |T0 x T1|^2, without cancellation for
-needles, and that of Sigma' + eps2d I is det + eps2d (trace + eps2d). And the gradient of the conic Q is -Q v_Q Q.
+The twin of `tsplat_reference.projection`. A covariance given as quaternion and scales is never formed, as float32 would lose needles: with
+F = R S, Sigma' = T T^T for T = J W F. Its determinant is then |T0 x T1|^2, and that of Sigma' + eps2d I is det + eps2d (trace + eps2d).
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ import torch
 import triton
 import triton.language as tl
 from torch import Tensor
-from tsplat_reference.constants import ALPHA_MIN, COMPENSATION_MIN, EXTENT_MAX, FRUSTUM_MARGIN, LARGEST
+from tsplat_reference.constants import ALPHA_MIN, COMPENSATION_MIN, FRUSTUM_MARGIN, LARGEST
 
 from tsplat.kernels.camera import (
     dot,
@@ -113,6 +112,12 @@ def load_shape(quats, scales, covars, n, wanted, LARGEST: tl.constexpr):
 
 
 @triton.jit
+def cross(a, b):
+    """Vector product."""
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@triton.jit
 def covariance2d(M, F, HAS_COVARS: tl.constexpr):
     """T = M F, then xx, xy, yy and the determinant of Sigma' = M Sigma M^T (3DGS, equation 5) without blur."""
     T0 = transform_transposed(F, M[0])
@@ -123,17 +128,14 @@ def covariance2d(M, F, HAS_COVARS: tl.constexpr):
         c = dot(T1, M[1])
         return T0, T1, a, b, c, a * c - b * b
     else:
-        x = T0[1] * T1[2] - T0[2] * T1[1]
-        y = T0[2] * T1[0] - T0[0] * T1[2]
-        z = T0[0] * T1[1] - T0[1] * T1[0]
-        return T0, T1, dot(T0, T0), dot(T0, T1), dot(T1, T1), x * x + y * y + z * z
+        normal = cross(T0, T1)
+        return T0, T1, dot(T0, T0), dot(T0, T1), dot(T1, T1), dot(normal, normal)
 
 
 @triton.jit
-def compensation(det_sharp, det, FLOOR: tl.constexpr):
-    """Ratio of the determinants, and its root, FLOOR at the least."""
-    ratio = det_sharp / det
-    return ratio, tl.sqrt(tl.where(ratio > FLOOR * FLOOR, ratio, FLOOR * FLOOR))
+def compensation(ratio, FLOOR: tl.constexpr):
+    """Root of the ratio of the determinants, FLOOR at the least."""
+    return tl.sqrt(tl.where(ratio > FLOOR * FLOOR, ratio, FLOOR * FLOOR))
 
 
 @triton.jit
@@ -146,7 +148,7 @@ def half_size(extent, variance):
 @triton.jit(do_not_specialize=["N", "C", "width", "height"])
 def project_fwd_kernel(means, quats, scales, covars, opacities, viewmats, Ks, radii, means2d, depths, conics, compensations, N, C, width,
                        height, near: tl.float64, far: tl.float64, eps2d: tl.float64, MODEL: tl.constexpr, ANTIALIASED: tl.constexpr,
-                       MARGIN: tl.constexpr, FLOOR: tl.constexpr, ALPHA_MIN: tl.constexpr, EXTENT_MAX: tl.constexpr, LARGEST: tl.constexpr,
+                       MARGIN: tl.constexpr, FLOOR: tl.constexpr, ALPHA_MIN: tl.constexpr, LARGEST: tl.constexpr,
                        BLOCK: tl.constexpr):
     """One camera and one block of splats; the cameras of a block are neighbours, which find its splats in the cache."""
     camera = (tl.program_id(0) % C).to(tl.int64)
@@ -175,11 +177,10 @@ def project_fwd_kernel(means, quats, scales, covars, opacities, viewmats, Ks, ra
     det = tl.where(valid, det, 1.0)
     scaling = tl.full((BLOCK,), 1.0, dt)
     if ANTIALIASED:
-        scaling = compensation(det_sharp, det, FLOOR)[1]
+        scaling = compensation(det_sharp / det, FLOOR)
         opacity *= scaling
-    # alpha reaches ALPHA_MIN at e standard deviations: e = min(EXTENT_MAX, sqrt(2 ln(o / ALPHA_MIN)))
+    # alpha reaches ALPHA_MIN at e standard deviations
     e = tl.sqrt(2.0 * tl.log(tl.where(opacity > ALPHA_MIN, opacity, ALPHA_MIN) / ALPHA_MIN))
-    e = tl.where(e < EXTENT_MAX, e, EXTENT_MAX)
     rx = half_size(e, tl.where(valid, a, 0.0))
     ry = half_size(e, tl.where(valid, c, 0.0))
     valid &= (opacity >= ALPHA_MIN) & (rx > 0) & (ry > 0) & (u + rx > 0) & (u - rx < width) & (v + ry > 0) & (v - ry < height)
@@ -203,6 +204,12 @@ def load_visible(radii, row, inside):
 def combine(a, u, b, v):
     """a u + b v of 3-vectors."""
     return a * u[0] + b * v[0], a * u[1] + b * v[1], a * u[2] + b * v[2]
+
+
+@triton.jit
+def where_valid(valid, v):
+    """The 3-vector, 0 where not valid."""
+    return tl.where(valid, v[0], 0.0), tl.where(valid, v[1], 0.0), tl.where(valid, v[2], 0.0)
 
 
 @triton.jit
@@ -245,37 +252,45 @@ def project_bwd_kernel(means, quats, scales, covars, viewmats, Ks, radii, v_mean
         _, _, J0, J1 = project_point(p, intrinsics, width, height, MODEL, MARGIN)
         M = (transform_transposed(W, J0), transform_transposed(W, J1))
         T0, T1, a, b, c, det_sharp = covariance2d(M, F, covars is not None)
-        det = tl.where(valid, det_sharp + eps * (a + c + eps), 1.0)
+        trace = a + c + eps
+        inverse = 1.0 / tl.where(valid, det_sharp + eps * trace, 1.0)
+        blur = eps * inverse
 
-        # conic Q = (A, B, C) of the inverse, so v_Sigma' = -Q v_Q Q; v_b counts both entries off the diagonal
-        v_A, v_B, v_C = load_row(v_conics + row * 3, valid, 3, 1)
-        qa = (c + eps) / det
-        qb = -b / det
-        qc = (a + eps) / det
-        v_a = -(qa * qa * v_A + qa * qb * v_B + qb * qb * v_C)
-        v_b = -(2.0 * qa * qb * v_A + (qa * qc + qb * qb) * v_B + 2.0 * qb * qc * v_C)
-        v_c = -(qb * qb * v_A + qb * qc * v_B + qc * qc * v_C)
-        if v_compensations is not None:
-            ratio, scaling = compensation(det_sharp, det, FLOOR)
-            v_scaling = tl.load(v_compensations + row, mask=valid, other=0.0)
-            v_ratio = tl.where(ratio >= FLOOR * FLOOR, v_scaling / (2.0 * scaling * det), 0.0)         # over det, as the rest
-            v_a += v_ratio * (c - ratio * (c + eps))
-            v_b += v_ratio * 2.0 * b * (ratio - 1.0)
-            v_c += v_ratio * (a - ratio * (a + eps))
-        v_a = tl.where(valid, v_a, 0.0)
-        v_b = tl.where(valid, v_b, 0.0)
-        v_c = tl.where(valid, v_c, 0.0)
-
-        # Sigma' = M Sigma M^T = T T^T
-        v_M0 = combine(2.0 * v_a, T0, v_b, T1)
-        v_M1 = combine(v_b, T0, 2.0 * v_c, T1)
+        # conic Q = (A, B, C), the inverse of Sigma': v_Sigma' = -Q v_Q Q; wanted is G = 2 v_Sigma' T, or 2 v_Sigma' M if Sigma is given, by
+        # way of X = adj(Sigma' before blur) T/det and Q T: see the reference
+        qa = (c + eps) * inverse
+        qb = -b * inverse
+        qc = (a + eps) * inverse
         if covars is not None:
-            v_F = add_outer(v_F, M[0], combine(v_a, M[0], 0.5 * v_b, M[1]))
-            v_F = add_outer(v_F, M[1], combine(0.5 * v_b, M[0], v_c, M[1]))
+            T0 = M[0]
+            T1 = M[1]
+            X0 = combine(c * inverse, T0, qb, T1)
+            X1 = combine(qb, T0, a * inverse, T1)
         else:
-            v_F = add_outer(add_outer(v_F, M[0], v_M0), M[1], v_M1)             # so far, v_M0 and v_M1 are v_T0 and v_T1
-            v_M0 = transform(F, v_M0)
-            v_M1 = transform(F, v_M1)
+            normal = cross(T0, T1)
+            normal = (normal[0] * inverse, normal[1] * inverse, normal[2] * inverse)
+            X0 = cross(T1, normal)
+            X1 = cross(normal, T0)
+        U0 = combine(1.0, X0, blur, T0)
+        U1 = combine(1.0, X1, blur, T1)
+        v_A, v_B, v_C = load_row(v_conics + row * 3, valid, 3, 1)
+        VU0 = combine(2.0 * v_A, U0, v_B, U1)
+        VU1 = combine(v_B, U0, 2.0 * v_C, U1)
+        G0 = combine(-qa, VU0, -qb, VU1)
+        G1 = combine(-qb, VU0, -qc, VU1)
+        if v_compensations is not None:
+            ratio = det_sharp * inverse
+            v_scaling = tl.load(v_compensations + row, mask=valid, other=0.0)
+            v_ratio = tl.where(ratio >= FLOOR * FLOOR, v_scaling / compensation(ratio, FLOOR), 0.0) * blur
+            G0 = combine(1.0, combine(1.0, G0, v_ratio * trace, X0), -v_ratio * ratio, T0)
+            G1 = combine(1.0, combine(1.0, G1, v_ratio * trace, X1), -v_ratio * ratio, T1)
+        G0 = where_valid(valid, G0)
+        G1 = where_valid(valid, G1)
+
+        # Sigma' = T T^T, T = M F; or M Sigma M^T
+        v_F = add_outer(add_outer(v_F, M[0], G0), M[1], G1)
+        v_M0 = transform(F, G0)
+        v_M1 = transform(F, G1)
 
         # M = J W, p = W mean + t
         v_u, v_v = load_row(v_means2d + row * 2, valid, 2, 2)
@@ -293,6 +308,7 @@ def project_bwd_kernel(means, quats, scales, covars, viewmats, Ks, radii, v_mean
 
     store_row(v_means + n * 3, v_mean, inside, 3, 1)
     if covars is not None:
+        v_F = scale_columns(v_F, (0.5, 0.5, 0.5))
         store_row(v_covars + n * 9, v_F[0] + v_F[1] + v_F[2], inside, 9, 1)
     else:
         v_quat, v_scale = factor_backward(load_quat(quats, n, seen), load_row(scales + n * 3, seen, 3, 1), v_F)
@@ -312,8 +328,8 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
         project_fwd_kernel[(ceil_div(N, options["BLOCK"]) * C,)](
             means.contiguous(), *map(_contiguous, (quats, scales, covars)), opacities.contiguous(), viewmats.contiguous(),
             Ks.contiguous(), radii, means2d, depths, conics, compensations, N, C, width, height, near, far, eps2d, MODEL=model,
-            ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, ALPHA_MIN=ALPHA_MIN, EXTENT_MAX=EXTENT_MAX,
-            LARGEST=LARGEST, **options, enable_fp_fusion=True)
+            ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, ALPHA_MIN=ALPHA_MIN, LARGEST=LARGEST,
+            **options, enable_fp_fusion=True)
     return radii, means2d, depths, conics, compensations
 
 

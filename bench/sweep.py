@@ -18,18 +18,18 @@ from gpu import SIZES, milliseconds, stage_calls, to
 from scenes import random_scene
 
 SPLATS = [{"BLOCK": block, "num_warps": warps} for block, warps in itertools.product((32, 64, 128, 256), (1, 2, 4)) if block >= 32 * warps]
-PRODUCTS = [{"P": 64, "K": k, "DB": d, "num_warps": w} for k, d, w in itertools.product((16, 32, 64), (16, 32, 64, 128), (4, 8))]
-REGISTERS: list[dict[str, int]] = [{}, {"maxnreg": 88}, {"maxnreg": 80}, {"maxnreg": 72}]
+PRODUCTS = [{"K": k, "DB": d, "num_warps": w} for k, d, w in itertools.product((16, 32), (32, 64, 128), (4, 8))]
 CANDIDATES: dict[str, tuple[str, int, list[dict[str, int]]]] = {
     "project": ("project", 3, SPLATS),
     "project_backward": ("project_backward", 3, SPLATS),
     "bin": ("bin", 3, SPLATS),
     "pick": ("bin", 3, [{"BLOCK": b, "num_warps": w} for b in (32, 64, 128) for w in (1, 2) if b >= 32 * w]),
     "records": ("blend", 3, SPLATS),
-    "blend": ("blend", 3, [{"UNROLL": u, "num_warps": 1} | r for u in (1, 2, 4, 8) for r in REGISTERS]),
-    "blend_backward": ("blend_backward", 3, [{"num_warps": 1} | r for r in REGISTERS]),
-    "features": ("blend", 128, [c for c in PRODUCTS if c["DB"] >= 32]),
-    "features_backward": ("blend_backward", 128, [c for c in PRODUCTS if c["DB"] <= 64 and c["K"] <= 32]),
+    "blend": ("blend", 3, [{"UNROLL": u, "num_warps": 1} for u in (1, 2, 4, 8)]),
+    "blend_backward": ("blend_backward", 3, [{"num_warps": 1}, {"num_warps": 1, "maxnreg": 88}]),
+    "features": ("blend", 128, PRODUCTS),
+    "features_colors_backward": ("blend_backward", 128, PRODUCTS),
+    "features_backward": ("blend_backward", 128, PRODUCTS),
 }
 """Per kernel: the stage that it is timed in, the channels of the scene, and what to try."""
 
@@ -40,12 +40,14 @@ def main() -> int:
     parser.add_argument("--splats", type=int, default=1_000_000)
     parser.add_argument("--size", default="1080p", choices=list(SIZES))
     parser.add_argument("--times", type=int, default=10)
+    parser.add_argument("--only", nargs="*", default=[], metavar="NAME=VALUE", help="only candidates with these constants: num_warps=4")
     args = parser.parse_args()
     if not torch.cuda.is_available():
         print("bench/sweep.py: no GPU: torch.cuda.is_available() is False. Run it where there is one", file=sys.stderr)
         return 2
     from tsplat.kernels.launch import LAUNCHES, current_target
 
+    only = {name: int(value) for name, value in (o.split("=") for o in args.only)}
     scene, family = random_scene(args.splats, *SIZES[args.size]), current_target().family
     print(f"{torch.cuda.get_device_name()}, {args.splats} splats, {args.size}\n\n| kernel | constants | stage, ms | |\n| --- | --- | --- | --- |")
     for kernel in args.kernels:
@@ -53,7 +55,7 @@ def main() -> int:
         colors = torch.rand(args.splats, channels, generator=torch.Generator().manual_seed(0))
         calls, _, _ = stage_calls(to(scene._replace(colors=colors, background=torch.rand(channels)), torch.device("cuda")))
         stands = LAUNCHES[kernel][family]
-        times = sorted((time(calls[stage], LAUNCHES[kernel], family, c, args.times), list(c.items()), c == stands) for c in [*candidates, stands])
+        times = sorted((time(calls[stage], LAUNCHES[kernel], family, c, args.times), list(c.items()), c == stands) for c in [*(c for c in candidates if only.items() <= c.items()), stands])
         for ms, constants, is_stand in times[:6]:
             print(f"| {kernel} | {', '.join(f'{k} {v}' for k, v in constants)} | {ms:.4f} | {'*' if is_stand else ''} |", flush=True)
         own = next(ms for ms, _, is_stand in times if is_stand)

@@ -26,13 +26,19 @@ class Meta(NamedTuple):
     radii: int32 `[C, N, 2]`, half size in pixels of the box that a splat can touch; 0 if it is culled.
     means2d: `[C, N, 2]` in pixels; part of the graph (`meta.means2d.retain_grad()`).
     depths: `[C, N]`, camera z.
-    hits: int64 `[C, tiles_y, tiles_x]`, splats per tile.
+    offsets: int64 `[C tiles_y tiles_x + 1]`, where each tile's list of splats begins. tiles: (tiles_y, tiles_x).
     """
 
     radii: Tensor
     means2d: Tensor
     depths: Tensor
-    hits: Tensor
+    offsets: Tensor
+    tiles: tuple[int, int]
+
+    @property
+    def hits(self) -> Tensor:
+        """Int64 `[C, tiles_y, tiles_x]`: splats per tile."""
+        return self.offsets.diff().view(-1, *self.tiles)
 
     @property
     def visible(self) -> Tensor:
@@ -103,8 +109,8 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
     # not expand for one camera: its gradient is a sum, a kernel
     view_opacities = opacities * compensations if antialiased else opacities[None] if C == 1 else opacities.expand(C, -1)
 
-    visible = radii[..., 0] > 0                         # both are 0 of a splat that is culled
     if sh_degree is not None:
+        visible = radii[..., 0] > 0                     # both are 0 of a splat that is culled
         view_colors = (ops.harmonics(means, camera_centers(viewmats), colors, sh_degree, visible) + 0.5).clamp_min(0.0)
     else:
         view_colors = colors if colors.ndim == 3 else colors[None]
@@ -112,8 +118,8 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
     if depth is not None:
         view_colors = torch.cat([view_colors.expand(C, -1, -1), depths[..., None]], -1)
         backgrounds = None if backgrounds is None else torch.nn.functional.pad(backgrounds, (0, 1))
-    finite = view_colors.detach().abs().amax(-1) < float("inf")             # 3 kernels where isfinite().all(-1) has 5
-    radii = radii * (visible & finite)[..., None]
+    finite = torch.linalg.vector_norm(view_colors.detach(), torch.inf, -1) < torch.inf      # 2 kernels where isfinite().all(-1) has 5
+    radii = radii * finite[..., None]
 
     bins = ops.bin_splats(means2d, radii, conics, view_opacities, depths, width, height, tile)
     image, alpha = ops.blend(means2d, conics, view_opacities, view_colors, backgrounds, absgrad, bins.ids, bins.offsets, width, height,
@@ -122,7 +128,8 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
     if depth is not None:
         image, z = image[..., :-1], image[..., -1]
         z = z / alpha.clamp_min(1e-10) if depth == "expected" else z
-    meta = Meta(radii, means2d, depths, bins.offsets.diff().view(C, *reversed(tile_counts(width, height, tile))))
+    tiles_x, tiles_y = tile_counts(width, height, tile)
+    meta = Meta(radii, means2d, depths, bins.offsets, (tiles_y, tiles_x))
     if camera.batched:
         return Rendering(image, alpha, z, meta)
     # not image[0], of which the gradient is a zeroed and a copied image

@@ -180,7 +180,7 @@ def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Ten
 
 
 def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
-                          offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int,
+                          offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor | None, width: int, height: int,
                           tile: int, alpha_max: float, absgrad: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Closed-form gradients of `blend` with respect to means2d, conics, opacities and colors. (That of the background is the sum of
     (1 - alpha) dL/dimage.)
@@ -193,6 +193,7 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
     """
     lists = _lists(means2d, conics, opacities, colors, ids, offsets, width, height, tile, alpha_max)
     C, N, D = *opacities.shape, colors.shape[-1]
+    v_alphas = torch.zeros_like(alphas) if v_alphas is None else v_alphas
     if backgrounds is None:
         behind = torch.zeros_like(v_alphas)
     else:

@@ -1,7 +1,7 @@
 """Blending of 5 to 512 and more channels as matrix products: weights [pixels, splats] times features [splats, channels].
 
 The arithmetic of 16 channels and more is in the products, which the tensor cores do; peers loop over the channels on the scalar units.
-A program takes a quarter of a tile's pixels, so that its accumulators stay in registers, and a block of channels.
+A program takes the 64 pixels of a tile and, in the forward, a block of channels.
 """
 
 from __future__ import annotations
@@ -14,21 +14,19 @@ from tsplat.kernels.launch import Launcher
 
 
 @triton.jit
-def part_pixels(part, tiles_x, tiles_y, W, H, like, P: tl.constexpr):
-    """P pixels of a tile: its number, the camera, x and y `[P, 1]` about the tile's centre, that centre, the indices and which exist."""
-    parts: tl.constexpr = TILE * TILE // P
-    tile = part // parts
-    p = part % parts * P + tl.arange(0, P)
+def tile_pixels(tile, tiles_x, tiles_y, W, H, like, P: tl.constexpr):
+    """The P pixels of a tile: the camera, x and y `[P, 1]` about the tile's centre, that centre, the index of its first pixel and of the others
+    from there (32 bits, which halves the registers of addresses), and which exist."""
+    p = tl.arange(0, P)
     view = tile // (tiles_x * tiles_y)
     left = (tile % tiles_x) * TILE
     top = (tile // tiles_x) % tiles_y * TILE
     half: tl.constexpr = TILE / 2
-    column = left + p % TILE
-    row = top + p // TILE
     x = ((p % TILE).to(like) + (0.5 - half))[:, None]
     y = ((p // TILE).to(like) + (0.5 - half))[:, None]
-    pixel = (view.to(tl.int64) * H + row) * W + column
-    return tile, view, x, y, left.to(like) + half, top.to(like) + half, pixel, (column < W) & (row < H)
+    first = (view.to(tl.int64) * H + top) * W + left
+    inside = (left + p % TILE < W) & (top + p // TILE < H)
+    return view, x, y, left.to(like) + half, top.to(like) + half, first, p // TILE * W + p % TILE, inside
 
 
 @triton.jit
@@ -57,9 +55,10 @@ def chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha: tl.co
 def feature_fwd_kernel(records, colors, ids, offsets, backgrounds, image, alphas, W, H, tiles_x, tiles_y, null, N, D,
                        BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, P: tl.constexpr, K: tl.constexpr,
                        DB: tl.constexpr, PRECISION: tl.constexpr):
-    """DB channels of the image at P pixels of a tile."""
+    """DB channels of the image of a tile."""
     dt: tl.constexpr = records.dtype.element_ty
-    tile, view, x, y, cx, cy, pixel, inside = part_pixels(tl.program_id(0), tiles_x, tiles_y, W, H, dt, P)
+    tile = tl.program_id(0)
+    view, x, y, cx, cy, first, pixel, inside = tile_pixels(tile, tiles_x, tiles_y, W, H, dt, P)
     d = tl.program_id(1) * DB + tl.arange(0, DB)
     T = inside.to(dt)
     total = tl.zeros([P, DB], dt)
@@ -76,22 +75,51 @@ def feature_fwd_kernel(records, colors, ids, offsets, backgrounds, image, alphas
     mask = inside[:, None] & (d < D)[None, :]
     if BACKGROUND:
         total += T[:, None] * tl.load(backgrounds + view * D + d, mask=d < D, other=0.0)[None, :]
-    tl.store(image + pixel[:, None] * D + d[None, :], total, mask=mask)
+    tl.store(image + first * D + (pixel[:, None] * D + d[None, :]), total, mask=mask)
     if tl.program_id(1) == 0:
-        tl.store(alphas + pixel, 1.0 - T, mask=inside)
+        tl.store(alphas + first + pixel, 1.0 - T, mask=inside)
 
 
 @Launcher
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null", "N", "D"])
-def feature_bwd_kernel(records, colors, ids, offsets, rest_image, v_weights, v_image, sums, v_colors, W, H, tiles_x, tiles_y, null, N, D,
+def feature_colors_bwd_kernel(records, ids, offsets, v_image, v_colors, W, H, tiles_x, tiles_y, null, N, D, ALPHA_MAX: tl.constexpr,
+                              log2_alpha: tl.constexpr, P: tl.constexpr, K: tl.constexpr, DB: tl.constexpr, PRECISION: tl.constexpr):
+    """DB channels of the gradient of the features, by atomics: weights^T times the image's gradient, which stays at hand for all splats."""
+    dt: tl.constexpr = records.dtype.element_ty
+    tile = tl.program_id(0)
+    _, x, y, cx, cy, first, pixel, inside = tile_pixels(tile, tiles_x, tiles_y, W, H, dt, P)
+    d = tl.program_id(1) * DB + tl.arange(0, DB)
+    real_d = (d < D)[:, None]
+    V = tl.load(v_image + first * D + (pixel[None, :] * D + d[:, None]), mask=inside[None, :] & real_d, other=0.0)             # [DB, P]
+    T = inside.to(dt)
+    i = tl.load(offsets + tile)
+    end = tl.load(offsets + tile + 1)
+    alive = True
+    while (i < end) & alive:
+        chunk = chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha, ALPHA_MAX, K)
+        splat = chunk[0]
+        w = chunk[7]
+        T = chunk[8]
+        v_F = tl.dot(V, w, input_precision=PRECISION, out_dtype=dt)                                                            # [DB, K]
+        real = (i + tl.arange(0, K) < end)[None, :] & real_d
+        tl.atomic_add(v_colors + (splat % N)[None, :] * D + d[:, None], v_F, mask=real, sem="relaxed")
+        i += K
+        alive = tl.max(T, 0) > T_MIN
+
+
+@Launcher
+@triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null", "N", "D"])
+def feature_bwd_kernel(records, colors, ids, offsets, rest_image, v_weights, v_image, sums, W, H, tiles_x, tiles_y, null, N, D,
                        ABSGRAD: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, block_moments: tl.constexpr,
                        mean_slopes: tl.constexpr, P: tl.constexpr, K: tl.constexpr, DB: tl.constexpr, PRECISION: tl.constexpr):
-    """Sums `[R, 16]` of the geometry and gradients of the features, by atomics; as `blend_bwd_kernel`, with K splats at a time."""
+    """Sums `[R, 16]` of the geometry, by atomics; as `blend_bwd_kernel`, with K splats at a time. (With the gradient of the features in the
+    same loop, it spilled.)"""
     dt: tl.constexpr = records.dtype.element_ty
-    tile, _, x, y, cx, cy, pixel, inside = part_pixels(tl.program_id(0), tiles_x, tiles_y, W, H, dt, P)
+    tile = tl.program_id(0)
+    _, x, y, cx, cy, first, pixel, inside = tile_pixels(tile, tiles_x, tiles_y, W, H, dt, P)
     T = inside.to(dt)
-    rest = tl.load(rest_image + pixel, mask=inside, other=0.0)
-    v_weight = tl.load(v_weights + pixel, mask=inside, other=0.0)
+    rest = tl.load(rest_image + first + pixel, mask=inside, other=0.0)
+    v_weight = tl.load(v_weights + first + pixel, mask=inside, other=0.0)
     i = tl.load(offsets + tile)
     end = tl.load(offsets + tile + 1)
     alive = True
@@ -103,12 +131,9 @@ def feature_bwd_kernel(records, colors, ids, offsets, rest_image, v_weights, v_i
         begin = 0
         while begin < D:
             d = begin + tl.arange(0, DB)
-            V = tl.load(v_image + pixel[:, None] * D + d[None, :], mask=inside[:, None] & (d < D)[None, :], other=0.0)
+            V = tl.load(v_image + first * D + (pixel[:, None] * D + d[None, :]), mask=inside[:, None] & (d < D)[None, :], other=0.0)
             F = tl.load(colors + row[None, :] + d[:, None], mask=real[None, :] & (d < D)[:, None], other=0.0)        # [DB, K]
             g = tl.dot(V, F, g, input_precision=PRECISION, out_dtype=dt)
-            # [DB, K] rather than [K, DB]: a product of only 16 rows would be replicated over the warps, and spill
-            v_F = tl.dot(tl.trans(V), w, input_precision=PRECISION, out_dtype=dt)
-            tl.atomic_add(v_colors + row[None, :] + d[:, None], v_F, mask=real[None, :] & (d < D)[:, None], sem="relaxed")
             begin += DB
         wg = w * g
         v = wg - alpha / (1.0 - alpha) * (rest[:, None] - tl.cumsum(wg, 1))

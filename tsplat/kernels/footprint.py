@@ -69,6 +69,13 @@ def block_moments(v, mx, my, x, y):
             tl.sum(vx * dx, 0, keep_dims=True), tl.sum(vx * dy, 0, keep_dims=True), tl.sum(vy * dy, 0, keep_dims=True))
 
 
+@triton.jit
+def store4(p, v0, v1, v2, v3, mask):
+    """Four consecutive numbers at each pointer: one 16-byte store."""
+    every = tl.reshape(tl.join(tl.join(v0, v2), tl.join(v1, v3)), (v0.shape[0], 4))
+    tl.store(p[:, None] + tl.arange(0, 4)[None, :], every, mask=mask[:, None])
+
+
 @Launcher
 @triton.jit(do_not_specialize=["R", "N"])
 def pack_kernel(means2d, conics, opacities, colors, records, R, N, D: tl.constexpr, BLOCK: tl.constexpr):
@@ -88,16 +95,17 @@ def pack_kernel(means2d, conics, opacities, colors, records, R, N, D: tl.constex
     l10 = tl.where(some, b / l00, 0.0)
     l11 = tl.sqrt(tl.maximum(c - l10 * l10, 0.0))
     opacity = tl.load(opacities + i, mask=real, other=0.0)
-    inside = i <= R
+    log2_opacity = tl.where(opacity > 0, tl.log2(tl.where(opacity > 0, opacity, 1.0)), -1e9)
+    row = (i % N) * D
     p = records + 12 * i
-    tl.store(p, tl.load(means2d + 2 * i, mask=real, other=0.0), mask=inside)
-    tl.store(p + 1, tl.load(means2d + 2 * i + 1, mask=real, other=0.0), mask=inside)
-    tl.store(p + 2, tl.where(some, l00 * scale, 0.0), mask=inside)
-    tl.store(p + 3, l10 * scale, mask=inside)
-    tl.store(p + 4, l11 * scale, mask=inside)
-    tl.store(p + 5, tl.where(opacity > 0, tl.log2(tl.where(opacity > 0, opacity, 1.0)), -1e9), mask=inside)
-    for channel in tl.static_range(D):
-        tl.store(p + 6 + channel, tl.load(colors + (i % N) * D + channel, mask=real, other=0.0), mask=inside)
+    inside = i <= R
+    store4(p, tl.load(means2d + 2 * i, mask=real, other=0.0), tl.load(means2d + 2 * i + 1, mask=real, other=0.0),
+           tl.where(some, l00 * scale, 0.0), l10 * scale, inside)
+    store4(p + 4, l11 * scale, log2_opacity, tl.load(colors + row, mask=real & (D > 0), other=0.0),
+           tl.load(colors + row + 1, mask=real & (D > 1), other=0.0), inside)
+    if D > 2:
+        c2 = tl.load(colors + row + 2, mask=real, other=0.0)
+        store4(p + 8, c2, tl.load(colors + row + 3, mask=real & (D > 3), other=0.0), c2, c2, inside)
 
 
 @Launcher

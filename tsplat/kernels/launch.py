@@ -105,8 +105,7 @@ def _splats(block: int, num_warps: int) -> dict[str, int]:
 # project, harmonics: a splat per thread, so that no thread repeats another's work. As few warps as can be where there are sums over the block:
 # one needs no step from warp to warp, and sums of more blocks to add up are a percent or two of what is read anyway. (project_backward in one
 # warp is compiled for 96 registers on sm_89, and spills.)
-# Features: pixels, splats and channels of a matrix product, the largest that
-# spill on no target.
+# features: splats and channels of a matrix product.
 LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "project": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
     "project_backward": {"nvidia": _splats(64, 2), "cdna": _splats(64, 1), "rdna": _splats(32, 1)},
@@ -117,8 +116,11 @@ LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "records": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
     "blend": {family: {"UNROLL": 4, "num_warps": 1} for family in FAMILIES},
     "blend_backward": {family: {"num_warps": 1} for family in FAMILIES},
-    "features": {family: {"P": 64, "K": 16, "DB": 32, "num_warps": 8} for family in FAMILIES},
-    "features_backward": {family: {"P": 64, "K": 16, "DB": 16, "num_warps": 8} for family in FAMILIES},
+    "features": {"nvidia": {"K": 16, "DB": 64, "num_warps": 4}, "cdna": {"K": 16, "DB": 32, "num_warps": 8},
+                 "rdna": {"K": 16, "DB": 32, "num_warps": 8}},
+    "features_colors_backward": {"nvidia": {"K": 16, "DB": 32, "num_warps": 4}, "cdna": {"K": 16, "DB": 32, "num_warps": 4},
+                                 "rdna": {"K": 16, "DB": 16, "num_warps": 8}},
+    "features_backward": {family: {"K": 16, "DB": 32, "num_warps": 4} for family in FAMILIES},
 }
 
 

@@ -32,7 +32,7 @@ def _blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, b
 
 
 def _blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
-                    offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int,
+                    offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor | None, width: int, height: int,
                     tile: int, alpha_max: float, absgrad: bool) -> Five:
     """Gradients of means2d, conics, opacities and colors, and the absolute gradient, `[C, 0, 2]` unless asked for."""
     v_means2d, v_conics, v_opacities, v_colors, v_abs = run_kernel(
@@ -53,7 +53,7 @@ def _blend_fake(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tens
 
 
 def _blend_backward_fake(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
-                         offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor, width: int, height: int,
+                         offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor | None, width: int, height: int,
                          tile: int, alpha_max: float, absgrad: bool) -> Five:
     C, N = opacities.shape
     return (*(x.new_empty(x.shape) for x in (means2d, conics, opacities, colors)),
@@ -63,12 +63,16 @@ def _blend_backward_fake(means2d: Tensor, conics: Tensor, opacities: Tensor, col
 def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
     means2d, conics, opacities, colors, backgrounds, absgrad, ids, offsets, *ctx.options = inputs
     ctx.absgrad = absgrad is not None
+    ctx.set_materialize_grads(False)
     ctx.save_for_backward(means2d, conics, opacities, colors, backgrounds, ids, offsets, *output)
 
 
-def _backward(ctx: Any, v_image: Tensor, v_alphas: Tensor) -> tuple[Any, ...]:
+def _backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None) -> tuple[Any, ...]:
+    if v_image is None and v_alphas is None:
+        return (None,) * 12
     tensors = ctx.saved_tensors
-    *v_inputs, v_abs = blend_backward_op(*tensors, v_image.contiguous(), v_alphas.contiguous(), *ctx.options, ctx.absgrad)
+    v_image = torch.zeros_like(tensors[7]) if v_image is None else v_image.contiguous()
+    *v_inputs, v_abs = blend_backward_op(*tensors, v_image, None if v_alphas is None else v_alphas.contiguous(), *ctx.options, ctx.absgrad)
     v_backgrounds = torch.einsum("chwd,chw->cd", v_image, 1 - tensors[8]) if ctx.needs_input_grad[4] else None
     return *v_inputs, v_backgrounds, v_abs if ctx.absgrad else None, *[None] * 6
 

@@ -35,6 +35,7 @@ from tsplat.ops.projection import project_backward_op
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZES = {"1080p": (1920, 1080), "4K": (3840, 2160)}
+GSPLAT_ALPHA_MAX = 0.999
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 
 
@@ -165,7 +166,7 @@ def measure(scene: Scene, copy_GBps: float) -> dict[str, Any]:
     v_image = torch.randn(height, width, scene.colors.shape[1], device=scene.means.device)
 
     def forward() -> Tensor:
-        return tsplat.rasterize(*leaves, camera, background=scene.background).image
+        return tsplat.rasterize(*leaves, camera, background=scene.background, alpha_max=GSPLAT_ALPHA_MAX).image
 
     def both() -> tuple[Tensor, ...]:
         return torch.autograd.grad(forward(), leaves, v_image)
@@ -198,7 +199,7 @@ def stage_calls(scene: Scene) -> tuple[dict[str, Callable[[], object]], int, int
         to_bin = p.means2d, p.radii, p.conics, scene.opacities[None], p.depths, width, height, 8
         bins = ops.bin_splats(*to_bin)
         splats = p.means2d, p.conics, scene.opacities[None], scene.colors[None], scene.background[None]
-        lists, options = (bins.ids, bins.offsets), (width, height, 8, 0.99)
+        lists, options = (bins.ids, bins.offsets), (width, height, 8, GSPLAT_ALPHA_MAX)
         outputs = ops.blend(*splats, None, *lists, *options)
         upstream = [torch.randn_like(x) for x in outputs]
         v = [torch.randn_like(x) for x in (p.means2d, p.depths, p.conics, p.compensations)]
@@ -216,7 +217,7 @@ def profile(scene: Scene) -> str:
     """The kernels of a forward and backward, ours and gsplat's, with their times."""
     leaves = [x.clone().requires_grad_() for x in scene[:5]]
     renderers: dict[str, Callable[[], Tensor]] = {
-        "tsplat": lambda: tsplat.rasterize(*leaves, scene.camera, background=scene.background).image}
+        "tsplat": lambda: tsplat.rasterize(*leaves, scene.camera, background=scene.background, alpha_max=GSPLAT_ALPHA_MAX).image}
     if (peer := gsplat_renderer(scene, leaves)) is not None:
         renderers["gsplat"] = peer
     text = ""

@@ -25,7 +25,7 @@ CANDIDATES: dict[str, tuple[str, int, list[dict[str, int]]]] = {
     "bin": ("bin", 3, SPLATS),
     "pick": ("bin", 3, [{"BLOCK": b, "num_warps": w} for b in (32, 64, 128) for w in (1, 2) if b >= 32 * w]),
     "records": ("blend", 3, SPLATS),
-    "blend": ("blend", 3, [{"UNROLL": u, "num_warps": 1} for u in (1, 2, 4, 8)]),
+    "blend": ("blend", 3, [{"num_warps": 1}, {"num_warps": 1, "maxnreg": 72}]),
     "blend_backward": ("blend_backward", 3, [{"num_warps": 1}, {"num_warps": 1, "maxnreg": 88}]),
     "features": ("blend", 128, PRODUCTS),
     "features_colors_backward": ("blend_backward", 128, PRODUCTS),

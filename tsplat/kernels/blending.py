@@ -16,13 +16,11 @@ from torch import Tensor
 
 from tsplat.kernels import footprint
 from tsplat.kernels.feature_blending import feature_bwd_kernel, feature_colors_bwd_kernel, feature_fwd_kernel
-from tsplat.kernels.footprint import LOG2_MIN, T_MIN, TILE
+from tsplat.kernels.footprint import LOG2_MIN, SUMS, T_MIN, TILE
 from tsplat.kernels.launch import Launcher, ceil_div, current_target, launch
 
 CHANNELS = 4
 """Up to here a splat's colour is in its record and a pixel's in registers."""
-SUMS = 16
-"""Row of sums per splat in the backward: 6 moments, 4 colours, 2 absolute gradients, 4 that pad it to 64 bytes."""
 
 
 @triton.jit
@@ -176,7 +174,7 @@ def splat_alpha(mx, my, l00, l10, l11, log2_opacity, x, y, T, log2_alpha: tl.con
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null"])
 def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, W, H, tiles_x, tiles_y, null, D: tl.constexpr,
                      BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, LANES: tl.constexpr,
-                     UNROLL: tl.constexpr, PTX: tl.constexpr):
+                     PTX: tl.constexpr):
     """Image `[C, H, W, D]` and alpha `[C, H, W]` of a block of tiles."""
     view, tile, exists, left, top, x, y, column4, pixel4 = tile_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
     cx = left.to(x.dtype) + TILE / 2
@@ -194,20 +192,19 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
         later = load_batch(ids, start, i + 2 * TILE, hits, null)        # two batches ahead, so that nothing waits for it
         prefetch_records(records, following, PTX)
         u = 0
-        while u < TILE:
-            for v in tl.static_range(UNROLL):
-                splat = of_batch(batch, u + v, ids, start, i, hits, null, PTX)
-                r = load_record(records, splat, D)
-                w = T * splat_alpha(r[0] - cx, r[1] - cy, r[2], r[3], r[4], r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
-                C0 += r[6] * w
-                if D > 1:
-                    C1 += r[7] * w
-                if D > 2:
-                    C2 += r[8] * w
-                if D > 3:
-                    C3 += r[9] * w
-                T -= w
-            u += UNROLL
+        while u < TILE:                                                 # a loop: unrolled, it takes more registers and is no faster
+            splat = of_batch(batch, u, ids, start, i, hits, null, PTX)
+            r = load_record(records, splat, D)
+            w = T * splat_alpha(r[0] - cx, r[1] - cy, r[2], r[3], r[4], r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
+            C0 += r[6] * w
+            if D > 1:
+                C1 += r[7] * w
+            if D > 2:
+                C2 += r[8] * w
+            if D > 3:
+                C3 += r[9] * w
+            T -= w
+            u += 1
         i += TILE
         batch = following
         following = later
@@ -298,7 +295,7 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
                      D: tl.constexpr, ALPHA_MAX: tl.constexpr, BACKGROUND: tl.constexpr, ABSGRAD: tl.constexpr, PER_HIT: tl.constexpr,
                      log2_alpha: tl.constexpr, lane_moments: tl.constexpr, mean_slopes: tl.constexpr, LANES: tl.constexpr,
                      PTX: tl.constexpr):
-    """Sums `[R, 16]` over the pixels, per splat (atomic), or per hit `[M, 16]` (PER_HIT, for the same bits in every run).
+    """Sums `[R, SUMS]` over the pixels, per splat (atomic), or per hit `[M, SUMS]` (PER_HIT, for the same bits in every run).
 
     Front to back: `rest` is what is still to come, times the upstream gradient; it starts as <image, dL/dimage> + alpha dL/dalpha without
     the background's share, and loses a term at each splat. dL/dlog alpha = w (g - rest/T), T behind the splat: two operations less than
@@ -374,11 +371,11 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
             COUNT: tl.constexpr = 12 if ABSGRAD or D > 3 else 9
             first, slot, second, second_slot, has_second = tile_sums(s0, sx, sy, sxx, sxy, syy, w0, w1, w2, w3, ax, ay, COUNT, PTX)
             if PER_HIT:
-                q = sums + (start + i + u) * 16
+                q = sums + (start + i + u) * SUMS
                 tl.store(q + slot, first, mask=real)
                 tl.store(q + second_slot, second, mask=real & has_second)
             else:
-                q = sums + splat.to(tl.int64) * 16
+                q = sums + splat.to(tl.int64) * SUMS
                 tl.atomic_add(q + slot, first, mask=real, sem="relaxed")
                 tl.atomic_add(q + second_slot, second, mask=real & has_second, sem="relaxed")
             u += 1
@@ -446,7 +443,7 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
     """Launcher; see `tsplat_reference.blend_blocks_backward`.
 
     Sums over pixels are atomic, so that their last bits differ from run to run, but not under `torch.use_deterministic_algorithms(True)`:
-    then each hit has a row of sums of its own (64 bytes), added up in order; more than 4 channels take a pass per 4.
+    then each hit has a row of sums of its own (48 bytes), added up in order; more than 4 channels take a pass per 4.
     """
     deterministic = torch.are_deterministic_algorithms_enabled()
     if deterministic and colors.shape[2] > CHANNELS:
@@ -454,7 +451,7 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
                           tile, alpha_max, absgrad)
     s = _Scene(means2d, conics, opacities, colors, backgrounds, ids, offsets, width, height, tile, alpha_max)
     v_image, v_alphas = v_image.contiguous(), None if v_alphas is None else v_alphas.contiguous()
-    sums = means2d.new_zeros(len(ids) if deterministic else s.R + 1, SUMS)
+    sums = means2d.new_zeros(len(ids) if deterministic else s.R + 1, SUMS.value)
     few = s.D <= CHANNELS
     v_colors = colors.new_empty(s.C, s.N, s.D) if few else torch.zeros_like(s.colors)
     if few:
@@ -463,7 +460,7 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
                                       lane_moments=footprint.lane_moments, mean_slopes=footprint.mean_slopes,
                                       **launch("blend_backward"), **s.warp)
         if deterministic:
-            sums = means2d.new_zeros(s.R + 1, SUMS).index_add_(0, ids.long(), sums)
+            sums = means2d.new_zeros(s.R + 1, SUMS.value).index_add_(0, ids.long(), sums)
     else:
         v_weights, rest = torch.zeros_like(alphas) if v_alphas is None else v_alphas, torch.einsum("chwd,chwd->chw", image, v_image)
         if backgrounds is not None:
@@ -478,12 +475,13 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
             s.records, s.colors, ids, offsets, rest, v_weights, v_image, sums, width, height, *s.grid, s.R, max(s.rows, 1), s.D,
             ABSGRAD=absgrad, block_moments=footprint.block_moments, mean_slopes=footprint.mean_slopes, **launch("features_backward"),
             **s.block)
+    del s.records                                       # its memory is enough for what comes now
     v_means2d, v_conics, v_opacities = torch.empty_like(means2d), torch.empty_like(s.conics), torch.empty_like(s.opacities)
     v_abs = means2d.new_empty(s.C, s.N if absgrad else 0, 2)
     if s.R:
         options = launch("records")
         footprint.unpack_kernel[(ceil_div(s.R, options["BLOCK"]),)](sums, s.conics, s.opacities, v_means2d, v_conics, v_opacities, v_colors,
-                                                                    v_abs, s.R, D=s.D if few else 0, ABSGRAD=absgrad, STRIDE=SUMS, **options)
+                                                                    v_abs, s.R, D=s.D if few else 0, ABSGRAD=absgrad, **options)
     if few and colors.shape[0] < s.C:
         v_colors = v_colors.sum(0, keepdim=True)
     return v_means2d, v_conics, v_opacities, v_colors, v_abs

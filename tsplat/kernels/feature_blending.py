@@ -9,7 +9,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from tsplat.kernels.footprint import LOG2_MIN, T_MIN, TILE
+from tsplat.kernels.footprint import LOG2_MIN, SUMS, T_MIN, TILE
 from tsplat.kernels.launch import Launcher
 
 
@@ -112,7 +112,7 @@ def feature_colors_bwd_kernel(records, ids, offsets, v_image, v_colors, W, H, ti
 def feature_bwd_kernel(records, colors, ids, offsets, rest_image, v_weights, v_image, sums, W, H, tiles_x, tiles_y, null, N, D,
                        ABSGRAD: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, block_moments: tl.constexpr,
                        mean_slopes: tl.constexpr, P: tl.constexpr, K: tl.constexpr, DB: tl.constexpr, PRECISION: tl.constexpr):
-    """Sums `[R, 16]` of the geometry, by atomics; as `blend_bwd_kernel`, with K splats at a time. (With the gradient of the features in the
+    """Sums `[R, SUMS]` of the geometry, by atomics; as `blend_bwd_kernel`, with K splats at a time. (With the gradient of the features in the
     same loop, it spilled.)"""
     dt: tl.constexpr = records.dtype.element_ty
     tile = tl.program_id(0)
@@ -140,7 +140,7 @@ def feature_bwd_kernel(records, colors, ids, offsets, rest_image, v_weights, v_i
         v = tl.where(alpha < tl.full((), ALPHA_MAX, dt), v, 0.0)
         rest -= tl.sum(wg, 1)
         s0, sx, sy, sxx, sxy, syy = block_moments(v, mx, my, x, y)
-        q = (sums + splat * 16)[None, :]
+        q = (sums + splat * SUMS)[None, :]
         mask = real[None, :]
         tl.atomic_add(q, s0, mask=mask, sem="relaxed")
         tl.atomic_add(q + 1, sx, mask=mask, sem="relaxed")

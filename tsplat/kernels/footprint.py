@@ -24,8 +24,8 @@ TILE = tl.constexpr(8)
 """Side of a tile: a lane takes a row."""
 RECORD = 12
 """Numbers in a record."""
-MOMENTS = 6
-"""Sums that the backward collects for the geometry of a splat: v times 1, dx, dy, dx^2, dx dy, dy^2, with v = dL/dlog alpha."""
+SUMS = tl.constexpr(12)
+"""Numbers in a row of sums, which the backward collects per splat: 6 moments, 4 colours, 2 absolute gradients."""
 
 
 @triton.jit
@@ -111,15 +111,15 @@ def pack_kernel(means2d, conics, opacities, colors, records, R, N, D: tl.constex
 @Launcher
 @triton.jit(do_not_specialize=["R"])
 def unpack_kernel(sums, conics, opacities, v_means2d, v_conics, v_opacities, v_colors, v_abs, R, D: tl.constexpr, ABSGRAD: tl.constexpr,
-                  STRIDE: tl.constexpr, BLOCK: tl.constexpr):
-    """Sums `[R, STRIDE]` to the gradients of means2d, conics, opacities and D colours, and the absolute gradient."""
+                  BLOCK: tl.constexpr):
+    """Sums `[R, SUMS]` to the gradients of means2d, conics, opacities and D colours, and the absolute gradient."""
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     real = i < R
     a = tl.load(conics + 3 * i, mask=real, other=0.0)
     b = tl.load(conics + 3 * i + 1, mask=real, other=0.0)
     c = tl.load(conics + 3 * i + 2, mask=real, other=0.0)
     opacity = tl.load(opacities + i, mask=real, other=0.0)
-    p = sums + STRIDE * i
+    p = sums + SUMS * i
     s0 = tl.load(p, mask=real, other=0.0)
     sx = tl.load(p + 1, mask=real, other=0.0)
     sy = tl.load(p + 2, mask=real, other=0.0)

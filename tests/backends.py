@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+import pytest
 import torch
 
 from tsplat import Camera
+from tsplat.ops.common import Op
 
 
 @dataclass(frozen=True)
@@ -30,5 +35,21 @@ class Backend:
         return value
 
 
-BACKENDS = {"reference": Backend("reference", torch.device("cpu"), torch.float64)}
-"""Kernels join here: interpreted ones on CPU tensors (`op.set_kernel_enabled("cpu", False)` for each op, in the fixture), CUDA on its own."""
+    @contextlib.contextmanager
+    def active(self) -> Iterator[Backend]:
+        """The ops run here: the interpreted kernels, too, take tensors of the CPU."""
+        with contextlib.ExitStack() as stack:
+            if self.name == "interpreter":
+                pytest.importorskip("triton", reason="Triton is not installed here")
+                for op in OPS:
+                    stack.enter_context(op.set_kernel_enabled("cpu", False))
+            yield self
+
+
+OPS: list[Op] = [getattr(importlib.import_module(f"tsplat.ops.{module}"), f"{name}_op") for module, name in (
+    ("projection", "project"), ("projection", "project_backward"), ("harmonics", "harmonics"), ("harmonics", "harmonics_backward"),
+    ("binning", "bin_splats"), ("binning", "bin_splats_fixed"), ("blending", "blend"), ("blending", "blend_backward"))]
+KERNELS = Backend("cuda", torch.device("cuda"), torch.float64) if torch.cuda.is_available() else Backend(
+    "interpreter", torch.device("cpu"), torch.float64)
+"""The Triton kernels: on a GPU if there is one, else interpreted."""
+BACKENDS = {b.name: b for b in (Backend("reference", torch.device("cpu"), torch.float64), KERNELS)}

@@ -12,15 +12,28 @@ if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")      # read when Triton is imported, which torch.compile does, too
 
 import pytest
-from backends import BACKENDS, Backend
+from backends import BACKENDS, KERNELS, Backend
+
+from tsplat.rasterize import TILE
 
 HERE = Path(__file__).resolve().parent
 
 
-@pytest.fixture(params=BACKENDS)
-def backend(request: pytest.FixtureRequest) -> Backend:
-    """Each backend in turn: a test that takes this runs on all of them."""
-    return BACKENDS[request.param]
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """A test that takes `backend` runs on all of them, or without the interpreter where its module says that this takes too long."""
+    if "backend" in metafunc.fixturenames:
+        slow = getattr(metafunc.module, "WITHOUT_INTERPRETER", False)
+        metafunc.parametrize("backend", [name for name in BACKENDS if not (slow and name == "interpreter")], indirect=True)
+
+
+@pytest.fixture
+def backend(request: pytest.FixtureRequest) -> Iterator[Backend]:
+    """Where the ops run in this test. Of a test with tiles of several sizes, the kernels run the one with theirs."""
+    tile = request.node.callspec.params.get("tile", TILE)
+    if request.param == KERNELS.name and tile != TILE:
+        pytest.skip(f"the kernels have tiles of {TILE} pixels; got {tile}")
+    with BACKENDS[request.param].active() as backend:
+        yield backend
 
 
 @pytest.fixture(scope="session")

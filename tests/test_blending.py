@@ -98,7 +98,7 @@ def test_an_image_of_one_tile(backend: Backend, width: int, height: int, channel
 
 
 def test_many_cameras(backend: Backend) -> None:
-    assert_all_three_agree(scenes.splats2d(33, 9, 7, 6), 7, 6, 4, backend=backend)
+    assert_all_three_agree(scenes.splats2d(33, 9, 13, 10), 13, 10, 8, backend=backend)
 
 
 @pytest.mark.parametrize("alpha_max", [0.5, 0.99, 0.999])
@@ -290,7 +290,7 @@ def test_layout_of_inputs_and_upstream_gradients_does_not_matter(backend: Backen
     v = torch.randn_like(want[0]), torch.randn_like(want[1])
     got = ops.blend(*(strided(x) for x in s[:5]), None, strided(bins.ids), strided(bins.offsets), 23, 19, 8, ALPHA_MAX)
     assert_same_bits(got, want)
-    assert_close(torch.autograd.grad(got, inputs, [strided(x) for x in v]), torch.autograd.grad(want, inputs, v), 1e-15)
+    assert_close(torch.autograd.grad(got, inputs, [strided(x) for x in v]), torch.autograd.grad(want, inputs, v), 1e-14)     # atomics
 
 
 @pytest.mark.parametrize("tile", [4, 8, 16])

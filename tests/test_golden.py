@@ -26,6 +26,7 @@ from torch import Tensor
 
 from tsplat import Camera, Gaussians, ops, rasterize
 
+WITHOUT_INTERPRETER = True           # minutes there
 ROUNDING = 6e-8
 """Half an ulp of float32, relative: what is left of numbers that were computed in float64 and stored in float32."""
 INPUTS = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds")

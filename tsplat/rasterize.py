@@ -27,6 +27,7 @@ class Meta(NamedTuple):
     means2d: `[C, N, 2]` in pixels; part of the graph (`meta.means2d.retain_grad()`).
     depths: `[C, N]`, camera z.
     offsets: int64 `[C tiles_y tiles_x + 1]`, where each tile's list of splats begins. tiles: (tiles_y, tiles_x).
+    needed: int64 `[]`, the capacity that was needed, if one was given: if it is more than that, splats are missing in the image.
     """
 
     radii: Tensor
@@ -34,6 +35,7 @@ class Meta(NamedTuple):
     depths: Tensor
     offsets: Tensor
     tiles: tuple[int, int]
+    needed: Tensor | None = None
 
     @property
     def hits(self) -> Tensor:
@@ -66,7 +68,8 @@ class Rendering(NamedTuple):
 def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, colors: Tensor, camera: Camera, *,
               sh_degree: int | None = None, covars: Tensor | None = None, background: Tensor | None = None,
               depth: DepthMode | None = None, antialiased: bool = False, eps2d: float = EPS2D, alpha_max: float = ALPHA_MAX,
-              screen_offset: Tensor | None = None, absgrad: Tensor | None = None, tile: int | None = None) -> Rendering:
+              screen_offset: Tensor | None = None, absgrad: Tensor | None = None, tile: int | None = None, capacity: int | None = None
+              ) -> Rendering:
     """Render N Gaussians (3D Gaussian Splatting, sections 4 and 6).
 
     Differentiable in means, quats, scales or covars, opacities, colors, background, screen_offset and the camera's matrices;
@@ -91,6 +94,8 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
             gradient that density control needs, under torch.compile as well.
         absgrad: `[C, N, 2]` that requires grad; changes nothing, and receives the sum over pixels of |dL/dmean2d| (AbsGS).
         tile: pixels along the side of a tile; never visible in the result. 8, the default, is the only one on a GPU.
+        capacity: room for this many hits of splats and tiles, all cameras together: then nothing waits for the GPU to count them, and CUDA
+            graphs can capture the call. `meta.needed` tells how many it takes.
 
     Raises:
         ValueError, TypeError: naming the argument, what came and what is expected.
@@ -99,7 +104,7 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
     if tile is None:
         tile = TILE
     _check(means, quats, scales, opacities, colors, camera, sh_degree, covars, background, depth, eps2d, alpha_max, screen_offset, absgrad,
-           tile)
+           tile, capacity)
     C, width, height = len(camera), camera.width, camera.height
     viewmats, Ks = (camera.viewmats, camera.Ks) if camera.batched else (camera.viewmats[None], camera.Ks[None])
     radii, means2d, depths, conics, compensations = ops.project(
@@ -121,7 +126,8 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
     finite = torch.linalg.vector_norm(view_colors.detach(), torch.inf, -1) < torch.inf      # 2 kernels where isfinite().all(-1) has 5
     radii = radii * finite[..., None]
 
-    bins = ops.bin_splats(means2d, radii, conics, view_opacities, depths, width, height, tile)
+    to_bin = means2d, radii, conics, view_opacities, depths, width, height, tile
+    bins, needed = (ops.bin_splats(*to_bin), None) if capacity is None else ops.bin_splats_fixed(*to_bin, capacity)
     image, alpha = ops.blend(means2d, conics, view_opacities, view_colors, backgrounds, absgrad, bins.ids, bins.offsets, width, height,
                              tile, alpha_max)
     z = None
@@ -129,7 +135,7 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
         image, z = image[..., :-1], image[..., -1]
         z = z / alpha.clamp_min(1e-10) if depth == "expected" else z
     tiles_x, tiles_y = tile_counts(width, height, tile)
-    meta = Meta(radii, means2d, depths, bins.offsets, (tiles_y, tiles_x))
+    meta = Meta(radii, means2d, depths, bins.offsets, (tiles_y, tiles_x), needed)
     if camera.batched:
         return Rendering(image, alpha, z, meta)
     # not image[0], of which the gradient is a zeroed and a copied image
@@ -138,7 +144,7 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
 
 def _check(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, colors: Tensor, camera: Camera,
            sh_degree: int | None, covars: Tensor | None, background: Tensor | None, depth: str | None, eps2d: float, alpha_max: float,
-           screen_offset: Tensor | None, absgrad: Tensor | None, tile: int) -> None:
+           screen_offset: Tensor | None, absgrad: Tensor | None, tile: int, capacity: int | None) -> None:
     """Errors that name the argument, what came and what is expected."""
     check_tensor("means", means, ("N", 3))
     if means.dtype not in (torch.float32, torch.float64):
@@ -184,3 +190,5 @@ def _check(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities
         if probe is not None:
             check_tensor(name, probe, (C, N, 2), like=means)
     check_size("tile", tile)
+    if capacity is not None:
+        check_size("capacity", capacity)

@@ -402,7 +402,7 @@ class _Scene:
         (self.C, self.N), self.D = opacities.shape, colors.shape[2]
         self.R, self.rows = self.C * self.N, colors.shape[0] * self.N
         self.conics, self.opacities, self.colors = conics.contiguous(), opacities.contiguous(), colors.contiguous()
-        self.ids, self.offsets = ids, offsets
+        self.ids, self.offsets = ids.contiguous(), offsets.contiguous()
         self.backgrounds = colors if backgrounds is None else backgrounds.contiguous()      # any pointer, if it is not read
         self.grid = ceil_div(width, tile), ceil_div(height, tile)
         self.tiles = self.C * self.grid[0] * self.grid[1]
@@ -427,12 +427,12 @@ def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ba
     image, alphas = colors.new_empty(s.C, height, width, s.D), colors.new_empty(s.C, height, width)
     has_background = backgrounds is not None
     if s.D <= CHANNELS:
-        blend_fwd_kernel[(s.blocks,)](s.records, ids, offsets, s.backgrounds, image, alphas, s.lane_x, width, height, *s.grid, s.R,
+        blend_fwd_kernel[(s.blocks,)](s.records, s.ids, s.offsets, s.backgrounds, image, alphas, s.lane_x, width, height, *s.grid, s.R,
                                      BACKGROUND=has_background, **launch("blend"), **s.warp)
     else:
         options = launch("features")
         feature_fwd_kernel[(s.tiles, ceil_div(s.D, options["DB"]))](
-            s.records, s.colors, ids, offsets, s.backgrounds, image, alphas, width, height, *s.grid, s.R, max(s.rows, 1), s.D,
+            s.records, s.colors, s.ids, s.offsets, s.backgrounds, image, alphas, width, height, *s.grid, s.R, max(s.rows, 1), s.D,
             BACKGROUND=has_background, **options, **s.block)
     return image, alphas
 
@@ -450,17 +450,18 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
         return _in_passes(means2d, conics, opacities, colors, backgrounds, ids, offsets, image, alphas, v_image, v_alphas, width, height,
                           tile, alpha_max, absgrad)
     s = _Scene(means2d, conics, opacities, colors, backgrounds, ids, offsets, width, height, tile, alpha_max)
-    v_image, v_alphas = v_image.contiguous(), None if v_alphas is None else v_alphas.contiguous()
+    image, alphas, v_image = image.contiguous(), alphas.contiguous(), v_image.contiguous()
+    v_alphas = None if v_alphas is None else v_alphas.contiguous()
     sums = means2d.new_zeros(len(ids) if deterministic else s.R + 1, SUMS.value)
     few = s.D <= CHANNELS
     v_colors = colors.new_empty(s.C, s.N, s.D) if few else torch.zeros_like(s.colors)
     if few:
-        blend_bwd_kernel[(s.blocks,)](s.records, ids, offsets, s.backgrounds, image, alphas, v_image, v_alphas, sums, s.lane_x, width,
+        blend_bwd_kernel[(s.blocks,)](s.records, s.ids, s.offsets, s.backgrounds, image, alphas, v_image, v_alphas, sums, s.lane_x, width,
                                       height, *s.grid, s.R, BACKGROUND=backgrounds is not None, ABSGRAD=absgrad, PER_HIT=deterministic,
                                       lane_moments=footprint.lane_moments, mean_slopes=footprint.mean_slopes,
                                       **launch("blend_backward"), **s.warp)
         if deterministic:
-            sums = means2d.new_zeros(s.R + 1, SUMS.value).index_add_(0, ids.long(), sums)
+            sums = means2d.new_zeros(s.R + 1, SUMS.value).index_add_(0, s.ids.long(), sums)
     else:
         v_weights, rest = torch.zeros_like(alphas) if v_alphas is None else v_alphas, torch.einsum("chwd,chwd->chw", image, v_image)
         if backgrounds is not None:
@@ -470,13 +471,13 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
             rest = rest + alphas * v_alphas
         options = launch("features_colors_backward")
         feature_colors_bwd_kernel[(s.tiles, ceil_div(s.D, options["DB"]))](
-            s.records, ids, offsets, v_image, v_colors, width, height, *s.grid, s.R, max(s.rows, 1), s.D, **options, **s.block)
+            s.records, s.ids, s.offsets, v_image, v_colors, width, height, *s.grid, s.R, max(s.rows, 1), s.D, **options, **s.block)
         feature_bwd_kernel[(s.tiles,)](
-            s.records, s.colors, ids, offsets, rest, v_weights, v_image, sums, width, height, *s.grid, s.R, max(s.rows, 1), s.D,
+            s.records, s.colors, s.ids, s.offsets, rest, v_weights, v_image, sums, width, height, *s.grid, s.R, max(s.rows, 1), s.D,
             ABSGRAD=absgrad, block_moments=footprint.block_moments, mean_slopes=footprint.mean_slopes, **launch("features_backward"),
             **s.block)
     del s.records                                       # its memory is enough for what comes now
-    v_means2d, v_conics, v_opacities = torch.empty_like(means2d), torch.empty_like(s.conics), torch.empty_like(s.opacities)
+    v_means2d, v_conics, v_opacities = means2d.new_empty(means2d.shape), torch.empty_like(s.conics), torch.empty_like(s.opacities)
     v_abs = means2d.new_empty(s.C, s.N if absgrad else 0, 2)
     if s.R:
         options = launch("records")

@@ -199,7 +199,7 @@ def stage_calls(scene: Scene) -> tuple[dict[str, Callable[[], object]], int, int
         to_bin = p.means2d, p.radii, p.conics, scene.opacities[None], p.depths, width, height, 8
         bins = ops.bin_splats(*to_bin)
         splats = p.means2d, p.conics, scene.opacities[None], scene.colors[None], scene.background[None]
-        lists, options = (bins.ids, bins.offsets), (width, height, 8, GSPLAT_ALPHA_MAX)
+        lists, options = (bins.ids, bins.offsets), (width, height, 8, GSPLAT_ALPHA_MAX, False)
         outputs = ops.blend(*splats, None, *lists, *options)
         upstream = [torch.randn_like(x) for x in outputs]
         v = [torch.randn_like(x) for x in (p.means2d, p.depths, p.conics, p.compensations)]

@@ -100,9 +100,9 @@ def launch_everything(quick: bool) -> Iterator[tuple[str, Any]]:
     for D, absgrad in (every[1], every[4]) if quick else every:
         colors, images = t(1, N, D), (t(C, H, W, D), t(C, H, W))
         label = f"{D} channels{', absgrad' if absgrad else ''}"
-        yield label, lambda c=colors, D=D: blending.blend(*splats, c, t(C, D), ids, offsets, W, H, 8, 0.99)
+        yield label, lambda c=colors, D=D: blending.blend(*splats, c, t(C, D), ids, offsets, W, H, 8, 0.99, False)
         yield label, lambda c=colors, D=D, i=images, a=absgrad: blending.blend_backward(
-            *splats, c, t(C, D), ids, offsets, *i, *i, W, H, 8, 0.99, a)
+            *splats, c, t(C, D), ids, offsets, *i, *i, W, H, 8, 0.99, False, a)
 
 
 class Usage(NamedTuple):

@@ -28,10 +28,11 @@ class Case:
     bins: reference.Bins
     width: int
     height: int
+    drop_last: bool = False
 
     @property
     def arguments(self) -> tuple[Tensor | int | float | None, ...]:
-        return *self.splats[:5], *self.bins, self.width, self.height, TILE, ALPHA_MAX
+        return *self.splats[:5], *self.bins, self.width, self.height, TILE, ALPHA_MAX, self.drop_last
 
 
 def guarded(tensor: Tensor | None) -> Tensor | None:
@@ -117,7 +118,7 @@ def test_float32_is_as_close_as_its_rounding() -> None:
 def test_another_tile_raises() -> None:
     c = case(1, 2, 8, 8, device=DEVICE)
     with pytest.raises(ValueError, match="tile: expected 8"):
-        blending.blend(*c.arguments[:-2], 16, ALPHA_MAX)
+        blending.blend(*c.arguments[:-3], 16, ALPHA_MAX, False)
 
 
 BINNED = {"batch": (3, 40, 70, 41, {}), "large splats": (1, 10, 100, 37, {"size": (10.0, 40.0)}), "nothing": (1, 0, 20, 20, {}),

@@ -56,12 +56,13 @@ def bin_arguments(n: int = 6) -> tuple[Any, ...]:
     return s.means2d, s.radii, s.conics, s.opacities, s.depths, WIDTH, HEIGHT, TILE
 
 
-def blend_arguments(n: int = 6, background: bool = True, absgrad: bool = True, shared_colors: bool = False) -> tuple[Any, ...]:
+def blend_arguments(n: int = 6, background: bool = True, absgrad: bool = True, shared_colors: bool = False, drop_last: bool = False
+                    ) -> tuple[Any, ...]:
     s = splats2d(n)
     colors = s.colors[:1] if shared_colors else s.colors
     bins = reference.bin_splats(*bin_arguments(n))
     return (s.means2d, s.conics, s.opacities, colors, s.backgrounds if background else None,
-            torch.zeros_like(s.means2d) if absgrad else None, *bins, WIDTH, HEIGHT, TILE, 0.99)
+            torch.zeros_like(s.means2d) if absgrad else None, *bins, WIDTH, HEIGHT, TILE, 0.99, drop_last)
 
 
 def project_backward_arguments(antialiased: bool = True, covars: bool = False, n: int = 6, cameras: bool = True, sparse: bool = False

@@ -67,7 +67,7 @@ class Rendering(NamedTuple):
 
 def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, colors: Tensor, camera: Camera, *,
               sh_degree: int | None = None, covars: Tensor | None = None, background: Tensor | None = None,
-              depth: DepthMode | None = None, antialiased: bool = False, eps2d: float = EPS2D, alpha_max: float = ALPHA_MAX,
+              depth: DepthMode | None = None, antialiased: bool = False, eps2d: float = EPS2D, alpha_max: float = ALPHA_MAX, drop_last: bool = False,
               screen_offset: Tensor | None = None, absgrad: Tensor | None = None, tile: int | None = None, capacity: int | None = None
               ) -> Rendering:
     """Render N Gaussians (3D Gaussian Splatting, sections 4 and 6).
@@ -90,6 +90,8 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
         antialiased: scale opacities by what the blur `eps2d` added to each splat's area (Mip-Splatting's 2D filter).
         eps2d: added to the diagonal of the projected covariance, in pixels squared.
         alpha_max: clamp of alpha, in (0, 1); zero gradient where it acts. (gsplat up to 1.5.3: 0.999.)
+        drop_last: end pixels as peers (3DGS, gsplat) do: without the splat that takes the transmittance to 1e-4 or below, though it may weigh
+            1e-2. Else what is left out weighs at most 1e-4.
         screen_offset: `[C, N, 2]` in pixels, added to the projected means. Pass zeros that require grad to get the screen-space
             gradient that density control needs, under torch.compile as well.
         absgrad: `[C, N, 2]` that requires grad; changes nothing, and receives the sum over pixels of |dL/dmean2d| (AbsGS).
@@ -129,7 +131,7 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
     to_bin = means2d, radii, conics, view_opacities, depths, width, height, tile
     bins, needed = (ops.bin_splats(*to_bin), None) if capacity is None else ops.bin_splats_fixed(*to_bin, capacity)
     image, alpha = ops.blend(means2d, conics, view_opacities, view_colors, backgrounds, absgrad, bins.ids, bins.offsets, width, height,
-                             tile, alpha_max)
+                             tile, alpha_max, drop_last)
     z = None
     if depth is not None:
         image, z = image[..., :-1], image[..., -1]

@@ -18,11 +18,11 @@ PAIRS = 1 << 22
 
 
 def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor, offsets: Tensor,
-          width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
+          width: int, height: int, tile: int, alpha_max: float, drop_last: bool = False) -> tuple[Tensor, Tensor]:
     """Composite splats over each pixel: alpha_i = min(alpha_max, o_i exp(-sigma_i)), 0 below 1/255.
 
-    A splat contributes while the transmittance T_i in front of it is above 1e-4, so what is left out weighs at most 1e-4. (Peers
-    also drop the splat that takes T below 1e-4, which can weigh 1e-2.)
+    A splat contributes while the transmittance T_i in front of it is above 1e-4, so what is left out weighs at most 1e-4. Peers (3DGS, gsplat)
+    also drop the splat that takes T to 1e-4 or below, which can weigh 1e-2: so do we with `drop_last`.
 
     Args:
         means2d, conics, opacities: `[C, N, 2]`, `[C, N, 3]`, `[C, N]`.
@@ -30,6 +30,7 @@ def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ba
         backgrounds: `[C, D]`, or None for zeros.
         ids, offsets: of `bin_splats`, with the same width, height and tile.
         alpha_max: in (0, 1); alpha has zero gradient where it is clamped.
+        drop_last: the peers' rule for the end of a pixel.
 
     Returns:
         image `[C, H, W, D]` and alpha `[C, H, W]`, 1 - T_final.
@@ -49,8 +50,9 @@ def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ba
         alpha = footprint.log_alpha(px - mx, py - my, conics.reshape(-1, 3)[splat][:, None], opacities.reshape(-1)[splat][:, None])
         alpha = alpha.exp().clamp_max(alpha_max)
         alpha = torch.where((alpha >= ALPHA_MIN) & valid[:, None], alpha, 0.0)              # [T, P, K]
-        T = torch.cumprod(torch.cat([torch.ones_like(px), 1 - alpha], -1), -1)[..., :-1]    # in front of each splat
-        weights = alpha * torch.where(T > TRANSMITTANCE_MIN, T, 0.0)
+        T = torch.cumprod(torch.cat([torch.ones_like(px), 1 - alpha], -1), -1)
+        front, behind = T[..., :-1], T[..., 1:]
+        weights = alpha * torch.where((behind if drop_last else front) > TRANSMITTANCE_MIN, front, 0.0)
         rgb = weights @ colors.reshape(-1, D)[splat % N if len(colors) < C else splat]      # [T, P, D]
         parts.append(torch.cat([rgb, weights.sum(-1, keepdim=True)], -1))
     image = to_image(torch.cat(parts).mT, shape, width, height)

@@ -170,11 +170,18 @@ def splat_alpha(mx, my, l00, l10, l11, log2_opacity, x, y, T, log2_alpha: tl.con
     return alpha
 
 
+@triton.jit
+def without_last(w, T):
+    """Without the splat that would take the transmittance to T_MIN or below: there the pixel is finished, with T negative as a sign of it."""
+    last = (w > 0) & (T - w <= T_MIN)
+    return tl.where(last, 0.0, w), tl.where(last, -T, T)
+
+
 @Launcher
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null"])
 def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, W, H, tiles_x, tiles_y, null, D: tl.constexpr,
-                     BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, LANES: tl.constexpr,
-                     PTX: tl.constexpr):
+                     BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, DROP_LAST: tl.constexpr, log2_alpha: tl.constexpr,
+                     LANES: tl.constexpr, PTX: tl.constexpr):
     """Image `[C, H, W, D]` and alpha `[C, H, W]` of a block of tiles."""
     view, tile, exists, left, top, x, y, column4, pixel4 = tile_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
     cx = left.to(x.dtype) + TILE / 2
@@ -196,6 +203,8 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
             splat = of_batch(batch, u, ids, start, i, hits, null, PTX)
             r = load_record(records, splat, D)
             w = T * splat_alpha(r[0] - cx, r[1] - cy, r[2], r[3], r[4], r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
+            if DROP_LAST:
+                w, T = without_last(w, T)
             C0 += r[6] * w
             if D > 1:
                 C1 += r[7] * w
@@ -209,6 +218,8 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
         batch = following
         following = later
         longest = tl.where(tl.max(tl.max(T, 1), 0) > T_MIN, longest, 0)     # finished tiles are only looked for once per batch
+    if DROP_LAST:
+        T = tl.abs(T)
     if BACKGROUND:
         b = backgrounds + view * D
         C0 += T * tl.load(b)
@@ -292,9 +303,9 @@ def tile_sums(s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, COUNT: tl.conste
 @Launcher
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null"])
 def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image, v_alphas, sums, lane_x, W, H, tiles_x, tiles_y, null,
-                     D: tl.constexpr, ALPHA_MAX: tl.constexpr, BACKGROUND: tl.constexpr, ABSGRAD: tl.constexpr, PER_HIT: tl.constexpr,
-                     log2_alpha: tl.constexpr, lane_moments: tl.constexpr, mean_slopes: tl.constexpr, LANES: tl.constexpr,
-                     PTX: tl.constexpr):
+                     D: tl.constexpr, ALPHA_MAX: tl.constexpr, DROP_LAST: tl.constexpr, BACKGROUND: tl.constexpr, ABSGRAD: tl.constexpr,
+                     PER_HIT: tl.constexpr, log2_alpha: tl.constexpr, lane_moments: tl.constexpr, mean_slopes: tl.constexpr,
+                     LANES: tl.constexpr, PTX: tl.constexpr):
     """Sums `[R, SUMS]` over the pixels, per splat (atomic), or per hit `[M, SUMS]` (PER_HIT, for the same bits in every run).
 
     Front to back: `rest` is what is still to come, times the upstream gradient; it starts as <image, dL/dimage> + alpha dL/dalpha without
@@ -342,6 +353,8 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
             l00, l10, l11 = r[2:5]
             alpha = splat_alpha(mx, my, l00, l10, l11, r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
             w = alpha * T
+            if DROP_LAST:
+                w, T = without_last(w, T)
             g = v_weight + r[6] * v0
             if D > 1:
                 g += r[7] * v1
@@ -396,7 +409,7 @@ class _Scene:
     """Arguments of the kernels, contiguous, with records packed and launch constants chosen."""
 
     def __init__(self, means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
-                 offsets: Tensor, width: int, height: int, tile: int, alpha_max: float) -> None:
+                 offsets: Tensor, width: int, height: int, tile: int, alpha_max: float, drop_last: bool) -> None:
         if tile != TILE.value:
             raise ValueError(f"tile: expected {TILE.value}, the tile of the Triton kernels; got {tile}")
         (self.C, self.N), self.D = opacities.shape, colors.shape[2]
@@ -412,7 +425,7 @@ class _Scene:
             means2d.contiguous(), self.conics, self.opacities, self.colors, self.records, self.R, max(self.rows, 1),
             D=self.D if self.D <= CHANNELS else 0, **options)
         target = current_target()
-        self.common = {"ALPHA_MAX": alpha_max, "log2_alpha": footprint.log2_alpha, "enable_fp_fusion": True}
+        self.common = {"ALPHA_MAX": alpha_max, "DROP_LAST": drop_last, "log2_alpha": footprint.log2_alpha, "enable_fp_fusion": True}
         lanes, ptx = target.lanes, target.ptx and means2d.dtype == torch.float32
         self.lane_x = _lane_x(lanes, means2d.dtype, means2d.device)
         self.blocks = self.C * ceil_div(self.grid[0], 2) * ceil_div(self.grid[1], lanes // (2 * tile))
@@ -421,9 +434,9 @@ class _Scene:
 
 
 def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor, offsets: Tensor,
-          width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
+          width: int, height: int, tile: int, alpha_max: float, drop_last: bool) -> tuple[Tensor, Tensor]:
     """Launcher; see `tsplat_reference.blend`. Tiles are 8 pixels wide."""
-    s = _Scene(means2d, conics, opacities, colors, backgrounds, ids, offsets, width, height, tile, alpha_max)
+    s = _Scene(means2d, conics, opacities, colors, backgrounds, ids, offsets, width, height, tile, alpha_max, drop_last)
     image, alphas = colors.new_empty(s.C, height, width, s.D), colors.new_empty(s.C, height, width)
     has_background = backgrounds is not None
     if s.D <= CHANNELS:
@@ -439,7 +452,7 @@ def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ba
 
 def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
                    offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor | None, width: int, height: int, tile: int,
-                   alpha_max: float, absgrad: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+                   alpha_max: float, drop_last: bool, absgrad: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Launcher; see `tsplat_reference.blend_blocks_backward`.
 
     Sums over pixels are atomic, so that their last bits differ from run to run, but not under `torch.use_deterministic_algorithms(True)`:
@@ -448,8 +461,8 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
     deterministic = torch.are_deterministic_algorithms_enabled()
     if deterministic and colors.shape[2] > CHANNELS:
         return _in_passes(means2d, conics, opacities, colors, backgrounds, ids, offsets, image, alphas, v_image, v_alphas, width, height,
-                          tile, alpha_max, absgrad)
-    s = _Scene(means2d, conics, opacities, colors, backgrounds, ids, offsets, width, height, tile, alpha_max)
+                          tile, alpha_max, drop_last, absgrad)
+    s = _Scene(means2d, conics, opacities, colors, backgrounds, ids, offsets, width, height, tile, alpha_max, drop_last)
     image, alphas, v_image = image.contiguous(), alphas.contiguous(), v_image.contiguous()
     v_alphas = None if v_alphas is None else v_alphas.contiguous()
     sums = means2d.new_zeros(len(ids) if deterministic else s.R + 1, SUMS.value)
@@ -490,7 +503,7 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
 
 def _in_passes(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor, offsets: Tensor,
                image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor | None, width: int, height: int, tile: int, alpha_max: float,
-               absgrad: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+               drop_last: bool, absgrad: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """The backward by 4 channels at a time: it is linear in the upstream gradient, of which alpha's goes with the first pass."""
     if absgrad:
         raise NotImplementedError(f"absgrad: not deterministic for more than {CHANNELS} channels; got {colors.shape[2]}. "
@@ -501,6 +514,6 @@ def _in_passes(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tenso
         background = None if backgrounds is None else backgrounds[:, some]
         v_some = v_alphas if c == 0 else None
         parts.append(blend_backward(means2d, conics, opacities, colors[..., some], background, ids, offsets, image[..., some].contiguous(),
-                                    alphas, v_image[..., some], v_some, width, height, tile, alpha_max, False))
+                                    alphas, v_image[..., some], v_some, width, height, tile, alpha_max, drop_last, False))
     geometry = [torch.stack(v).sum(0) for v in list(zip(*parts, strict=True))[:3]]
     return geometry[0], geometry[1], geometry[2], torch.cat([p[3] for p in parts], -1), parts[0][4]

@@ -30,7 +30,8 @@ def tile_pixels(tile, tiles_x, tiles_y, W, H, like, P: tl.constexpr):
 
 
 @triton.jit
-def chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha: tl.constexpr, ALPHA_MAX: tl.constexpr, K: tl.constexpr):
+def chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha: tl.constexpr, ALPHA_MAX: tl.constexpr, DROP_LAST: tl.constexpr,
+                  K: tl.constexpr):
     """K splats at P pixels: indices `[K]`, record fields `[1, K]`, alpha (0 where it does not count), weight, and T behind them `[P]`."""
     j = i + tl.arange(0, K)
     splat = tl.load(ids + j, mask=j < end, other=null).to(tl.int64)
@@ -45,16 +46,19 @@ def chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha: tl.co
     alpha = tl.where(power >= LOG2_MIN, alpha, 0.0)                     # [P, K]
     behind = T[:, None] * tl.cumprod(1.0 - alpha, 1)
     front = behind / (1.0 - alpha)
-    counts = front > T_MIN
+    counts = (behind if DROP_LAST else front) > T_MIN
+    after = tl.min(tl.where(counts, behind, T[:, None]), 1)
+    if DROP_LAST:                                                       # negative: finished, as in `blend_fwd_kernel`
+        after = tl.where((tl.min(behind, 1) <= T_MIN) & (T > T_MIN), -after, after)
     alpha = tl.where(counts, alpha, 0.0)
-    return splat, mx, my, l00, l10, l11, alpha, front * alpha, tl.min(tl.where(counts, behind, T[:, None]), 1)
+    return splat, mx, my, l00, l10, l11, alpha, front * alpha, after
 
 
 @Launcher
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null", "N", "D"])
 def feature_fwd_kernel(records, colors, ids, offsets, backgrounds, image, alphas, W, H, tiles_x, tiles_y, null, N, D,
-                       BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, P: tl.constexpr, K: tl.constexpr,
-                       DB: tl.constexpr, PRECISION: tl.constexpr):
+                       BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, DROP_LAST: tl.constexpr, log2_alpha: tl.constexpr,
+                       P: tl.constexpr, K: tl.constexpr, DB: tl.constexpr, PRECISION: tl.constexpr):
     """DB channels of the image of a tile."""
     dt: tl.constexpr = records.dtype.element_ty
     tile = tl.program_id(0)
@@ -66,13 +70,18 @@ def feature_fwd_kernel(records, colors, ids, offsets, backgrounds, image, alphas
     end = tl.load(offsets + tile + 1)
     alive = True
     while (i < end) & alive:
-        splat, _, _, _, _, _, _, w, T = chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha, ALPHA_MAX, K)
+        chunk = chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha, ALPHA_MAX, DROP_LAST, K)
+        splat = chunk[0]
+        w = chunk[7]
+        T = chunk[8]
         real = (i + tl.arange(0, K) < end)[:, None] & (d < D)[None, :]
         F = tl.load(colors + (splat % N)[:, None] * D + d[None, :], mask=real, other=0.0)
         total = tl.dot(w, F, total, input_precision=PRECISION, out_dtype=dt)
         i += K
         alive = tl.max(T, 0) > T_MIN
     mask = inside[:, None] & (d < D)[None, :]
+    if DROP_LAST:
+        T = tl.abs(T)
     if BACKGROUND:
         total += T[:, None] * tl.load(backgrounds + view * D + d, mask=d < D, other=0.0)[None, :]
     tl.store(image + first * D + (pixel[:, None] * D + d[None, :]), total, mask=mask)
@@ -83,7 +92,8 @@ def feature_fwd_kernel(records, colors, ids, offsets, backgrounds, image, alphas
 @Launcher
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null", "N", "D"])
 def feature_colors_bwd_kernel(records, ids, offsets, v_image, v_colors, W, H, tiles_x, tiles_y, null, N, D, ALPHA_MAX: tl.constexpr,
-                              log2_alpha: tl.constexpr, P: tl.constexpr, K: tl.constexpr, DB: tl.constexpr, PRECISION: tl.constexpr):
+                              DROP_LAST: tl.constexpr, log2_alpha: tl.constexpr, P: tl.constexpr, K: tl.constexpr, DB: tl.constexpr,
+                              PRECISION: tl.constexpr):
     """DB channels of the gradient of the features, by atomics: weights^T times the image's gradient, which stays at hand for all splats."""
     dt: tl.constexpr = records.dtype.element_ty
     tile = tl.program_id(0)
@@ -96,7 +106,7 @@ def feature_colors_bwd_kernel(records, ids, offsets, v_image, v_colors, W, H, ti
     end = tl.load(offsets + tile + 1)
     alive = True
     while (i < end) & alive:
-        chunk = chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha, ALPHA_MAX, K)
+        chunk = chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha, ALPHA_MAX, DROP_LAST, K)
         splat = chunk[0]
         w = chunk[7]
         T = chunk[8]
@@ -110,7 +120,7 @@ def feature_colors_bwd_kernel(records, ids, offsets, v_image, v_colors, W, H, ti
 @Launcher
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null", "N", "D"])
 def feature_bwd_kernel(records, colors, ids, offsets, rest_image, v_weights, v_image, sums, W, H, tiles_x, tiles_y, null, N, D,
-                       ABSGRAD: tl.constexpr, ALPHA_MAX: tl.constexpr, log2_alpha: tl.constexpr, block_moments: tl.constexpr,
+                       ABSGRAD: tl.constexpr, ALPHA_MAX: tl.constexpr, DROP_LAST: tl.constexpr, log2_alpha: tl.constexpr, block_moments: tl.constexpr,
                        mean_slopes: tl.constexpr, P: tl.constexpr, K: tl.constexpr, DB: tl.constexpr, PRECISION: tl.constexpr):
     """Sums `[R, SUMS]` of the geometry, by atomics; as `blend_bwd_kernel`, with K splats at a time. (With the gradient of the features in the
     same loop, it spilled.)"""
@@ -124,7 +134,8 @@ def feature_bwd_kernel(records, colors, ids, offsets, rest_image, v_weights, v_i
     end = tl.load(offsets + tile + 1)
     alive = True
     while (i < end) & alive:
-        splat, mx, my, l00, l10, l11, alpha, w, T = chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha, ALPHA_MAX, K)
+        chunk = chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha, ALPHA_MAX, DROP_LAST, K)
+        splat, mx, my, l00, l10, l11, alpha, w, T = chunk
         real = i + tl.arange(0, K) < end
         row = (splat % N) * D
         g = tl.zeros([P, K], dt) + v_weight[:, None]

@@ -14,30 +14,32 @@ Five = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 
 
 def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None,
-          ids: Tensor, offsets: Tensor, width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
+          ids: Tensor, offsets: Tensor, width: int, height: int, tile: int, alpha_max: float, drop_last: bool = False
+          ) -> tuple[Tensor, Tensor]:
     """`tsplat_reference.blend` as an op, with gradients to means2d, conics, opacities, colors and backgrounds.
 
     `absgrad` `[C, N, 2]` changes nothing in the result; as its gradient it receives the sum over pixels of |dL/dmeans2d|.
     """
-    image, alphas = blend_op(means2d, conics, opacities, colors, backgrounds, absgrad, ids, offsets, width, height, tile, alpha_max)
+    image, alphas = blend_op(means2d, conics, opacities, colors, backgrounds, absgrad, ids, offsets, width, height, tile, alpha_max,
+                             drop_last)
     return image, alphas
 
 
 def _blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None,
-           ids: Tensor, offsets: Tensor, width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
+           ids: Tensor, offsets: Tensor, width: int, height: int, tile: int, alpha_max: float, drop_last: bool) -> tuple[Tensor, Tensor]:
     """Image and alpha."""
     image, alphas = run_kernel("blending", "blend", means2d, means2d, conics, opacities, colors, backgrounds, ids, offsets, width, height,
-                               tile, alpha_max)
+                               tile, alpha_max, drop_last)
     return image, alphas
 
 
 def _blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
                     offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor | None, width: int, height: int,
-                    tile: int, alpha_max: float, absgrad: bool) -> Five:
+                    tile: int, alpha_max: float, drop_last: bool, absgrad: bool) -> Five:
     """Gradients of means2d, conics, opacities and colors, and the absolute gradient, `[C, 0, 2]` unless asked for."""
     v_means2d, v_conics, v_opacities, v_colors, v_abs = run_kernel(
         "blending", "blend_backward", means2d, means2d, conics, opacities, colors, backgrounds, ids, offsets, image, alphas, v_image,
-        v_alphas, width, height, tile, alpha_max, absgrad)
+        v_alphas, width, height, tile, alpha_max, drop_last, absgrad)
     return v_means2d, v_conics, v_opacities, v_colors, v_abs
 
 
@@ -54,7 +56,7 @@ def _blend_fake(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tens
 
 def _blend_backward_fake(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
                          offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor | None, width: int, height: int,
-                         tile: int, alpha_max: float, absgrad: bool) -> Five:
+                         tile: int, alpha_max: float, drop_last: bool, absgrad: bool) -> Five:
     C, N = opacities.shape
     return (*(x.new_empty(x.shape) for x in (means2d, conics, opacities, colors)),
             means2d.new_empty(C, N if absgrad else 0, 2))  # type: ignore[return-value]
@@ -69,17 +71,17 @@ def _save(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> N
 
 def _backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None) -> tuple[Any, ...]:
     if v_image is None and v_alphas is None:
-        return (None,) * 12
+        return (None,) * 13
     tensors = ctx.saved_tensors
     v_image = torch.zeros_like(tensors[7]) if v_image is None else v_image.contiguous()
     *v_inputs, v_abs = blend_backward_op(*tensors, v_image, None if v_alphas is None else v_alphas.contiguous(), *ctx.options, ctx.absgrad)
     v_backgrounds = torch.einsum("chwd,chw->cd", v_image, 1 - tensors[8]) if ctx.needs_input_grad[4] else None
-    return *v_inputs, v_backgrounds, v_abs if ctx.absgrad else None, *[None] * 6
+    return *v_inputs, v_backgrounds, v_abs if ctx.absgrad else None, *[None] * 7
 
 
 def _save_backward(ctx: Any, inputs: tuple[Any, ...], output: Five) -> None:
     *differentiable, ids, offsets, _, _, v_image, v_alphas = inputs[:11]
-    ctx.options = inputs[11:15]
+    ctx.options = inputs[11:16]
     ctx.set_materialize_grads(False)
     ctx.save_for_backward(*differentiable, ids, offsets, v_image, v_alphas)
 
@@ -94,7 +96,7 @@ def _double_backward(ctx: Any, *v_gradients: Tensor) -> tuple[Any, ...]:
 
     v_inputs, v_cotangents = second_derivative(forward, (means2d, conics, opacities, colors, backgrounds), (v_image, v_alphas),
                                                (*v_gradients[:4], None))
-    return *v_inputs, *[None] * 4, *v_cotangents, *[None] * 5
+    return *v_inputs, *[None] * 4, *v_cotangents, *[None] * 6
 
 
 blend_op = Op("tsplat::blend", _blend, cpu=_blend_cpu, fake=_blend_fake, setup=_save, backward=_backward)

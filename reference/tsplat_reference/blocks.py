@@ -50,7 +50,7 @@ class _Lists:
     starts: Tensor          # int64 [tiles]
     counts: Tensor          # int64 [tiles]
     records: Tensor         # [C N, 6]
-    colors: Tensor          # [C N or N, D]
+    colors: Tensor          # [C N or N, D + 1]; the last channel is 1, for alpha
     shared: int             # N if all cameras share the colours, else 0
     alpha_max: float
     shape: tuple[int, int, int]     # C, tiles_y, tiles_x
@@ -64,7 +64,7 @@ class _Lists:
         each other, each at its own pace: no core waits for the slowest group of a round.
         """
         tiles = self.counts.sort(descending=True, stable=True).indices[:int((self.counts > 0).sum())]     # longest lists first
-        size = GROUP * 8 // (CHUNK * max(8, self.colors.shape[1]))
+        size = GROUP * 9 // (CHUNK * max(9, self.colors.shape[1]))
         size = max(1, min(size, max(GROUP_TILES, -(-len(tiles) // 8))))                     # some groups for each core
         strands = [map(function, self.chunks(some, light)) for some in torch.split(tiles, size)]
         with workers(len(self.ids) >= WORTH_WORKERS) as ordered_map:
@@ -93,7 +93,7 @@ class _Lists:
         cx = (tiles % self.shape[2] * self.tile).to(record.dtype) + self.tile / 2
         cy = (tiles // self.shape[2] % self.shape[1] * self.tile).to(record.dtype) + self.tile / 2
         rows = splats % self.shared if self.shared else splats
-        colors = torch.cat([self.colors.index_select(0, rows), self.colors.new_ones(len(rows), 1)], -1)
+        colors = self.colors.index_select(0, rows)
         return _Group(tiles, splats, rows, record, cx[:, None] - record[0], cy[:, None] - record[1], colors.view(*at.shape, -1),
                       bool(record[5].amax() >= math.log(self.alpha_max)))
 
@@ -107,7 +107,7 @@ class _Group(NamedTuple):
     record: Tensor          # [6, G, K]
     qx: Tensor              # [G, K], tile centre minus mean
     qy: Tensor
-    colors: Tensor          # [G, K, D + 1]; the last channel is 1, for alpha
+    colors: Tensor          # [G, K, D + 1]
     clamps: bool            # whether alpha can reach its clamp
 
 
@@ -116,7 +116,8 @@ def _lists(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, i
     C, N = opacities.shape
     tiles_x, tiles_y = tile_counts(width, height, tile)
     records = footprint.records(means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten()).T.contiguous()
-    return _Lists(ids, offsets[:-1], offsets.diff(), records, colors.reshape(-1, colors.shape[-1]), N if len(colors) < C else 0, alpha_max,
+    table = torch.nn.functional.pad(colors.reshape(-1, colors.shape[-1]), (0, 1), value=1.0)   # here, not for each hit
+    return _Lists(ids, offsets[:-1], offsets.diff(), records, table, N if len(colors) < C else 0, alpha_max,
                   (C, tiles_y, tiles_x), tile, footprint.monomials(tile, means2d.dtype, means2d.device))
 
 
@@ -161,7 +162,8 @@ def _weights(lists: _Lists, coefficients: Tensor, clamp: bool, light: Tensor, al
 
 def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
                  offsets: Tensor, width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
-    """As `blending.blend`, without autograd. Working memory beyond inputs and outputs: one number per pixel and channel, and constants."""
+    """As `blending.blend`, without autograd. Working memory beyond inputs and outputs: one number per pixel and channel, per splat its record
+    and colours, and constants."""
     lists = _lists(means2d, conics, opacities, colors, ids, offsets, width, height, tile, alpha_max)
     D = colors.shape[-1]
     light = _light(lists, width, height)

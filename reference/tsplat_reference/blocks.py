@@ -9,9 +9,9 @@ front of the next splat, and in the backward the rest: what is still to come, ti
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -21,6 +21,8 @@ from tsplat_reference.binning import tile_counts
 from tsplat_reference.blending import to_image, to_tiles
 from tsplat_reference.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 from tsplat_reference.parallel import workers
+
+R = TypeVar("R")
 
 CHUNK = 64
 """Splats of a tile per chunk. Finished pixels end with it, so more would waste work; fewer would pay the calls more often."""
@@ -48,28 +50,38 @@ class _Lists:
     starts: Tensor          # int64 [tiles]
     counts: Tensor          # int64 [tiles]
     records: Tensor         # [C N, 6]
-    colors: Tensor          # [C N or N, D]
+    colors: Tensor          # [C N or N, D + 1]; the last channel is 1, for alpha
     shared: int             # N if all cameras share the colours, else 0
     alpha_max: float
     shape: tuple[int, int, int]     # C, tiles_y, tiles_x
     tile: int
     monomials: Tensor       # [6, P]
 
-    def rounds(self, light: Tensor) -> Iterator[list[tuple[Tensor, int, int]]]:
-        """What is to do, front to back: groups of live tiles, longest lists first, with the range of list positions.
+    def run(self, function: Callable[[_Group], R], light: Tensor) -> Iterator[R]:
+        """The results of `function` of all that is to do, in an order that the number of threads does not change.
 
-        `light` `[tiles, P]`, the transmittance, is read between rounds; the groups of a round are independent.
+        `light` `[tiles, P]`, the transmittance, is what `function` updates at the tiles of its group. Groups of tiles go front to back beside
+        each other, each at its own pace: no core waits for the slowest group of a round.
         """
-        live = self.counts.sort(descending=True, stable=True).indices[:int((self.counts > 0).sum())]
+        tiles = self.counts.sort(descending=True, stable=True).indices[:int((self.counts > 0).sum())]     # longest lists first
+        size = GROUP * 9 // (CHUNK * max(9, self.colors.shape[1]))
+        size = max(1, min(size, max(GROUP_TILES, -(-len(tiles) // 8))))                     # some groups for each core
+        strands = [map(function, self.chunks(some, light)) for some in torch.split(tiles, size)]
+        with workers(len(self.ids) >= WORTH_WORKERS) as ordered_map:
+            yield from (result for result in ordered_map(_next, strands, repeat=True) if result is not None)
+
+    def chunks(self, tiles: Tensor, light: Tensor) -> Iterator[_Group]:
+        """The splats of a group of tiles, front to back; tiles that have no more, or no more light, drop out.
+
+        `light` `[tiles, P]`, the transmittance, is read between chunks.
+        """
+        counts = self.counts[tiles]
         begin = 0
-        while len(live):
-            k = min(CHUNK, int(self.counts[live[0]]) - begin)
-            size = max(1, GROUP * 8 // (k * max(8, self.colors.shape[1])))
-            size = min(size, max(GROUP_TILES, -(-len(live) // 8)))                          # some groups for each core
-            yield [(tiles, begin, min(CHUNK, int(self.counts[tiles[0]]) - begin)) for tiles in torch.split(live, size)]
+        while len(tiles):
+            yield self.group(tiles, begin, min(CHUNK, int(counts[0]) - begin))
             begin += CHUNK
-            live = live[:int((self.counts[live] > begin).sum())]
-            live = live[light[live].amax(1) > TRANSMITTANCE_MIN]
+            live = ((counts > begin) & (light.index_select(0, tiles).amax(1) > TRANSMITTANCE_MIN)).nonzero().squeeze(-1)
+            tiles, counts = tiles.index_select(0, live), counts.index_select(0, live)
 
     def group(self, tiles: Tensor, begin: int, k: int) -> _Group:
         """The splats begin..begin + k of the tiles."""
@@ -81,9 +93,9 @@ class _Lists:
         cx = (tiles % self.shape[2] * self.tile).to(record.dtype) + self.tile / 2
         cy = (tiles // self.shape[2] % self.shape[1] * self.tile).to(record.dtype) + self.tile / 2
         rows = splats % self.shared if self.shared else splats
-        colors = torch.cat([self.colors.index_select(0, rows), self.colors.new_ones(len(rows), 1)], -1)
+        colors = self.colors.index_select(0, rows)
         return _Group(tiles, splats, rows, record, cx[:, None] - record[0], cy[:, None] - record[1], colors.view(*at.shape, -1),
-                      bool((record[5] >= math.log(self.alpha_max)).any()))
+                      bool(record[5].amax() >= math.log(self.alpha_max)))
 
 
 class _Group(NamedTuple):
@@ -95,7 +107,7 @@ class _Group(NamedTuple):
     record: Tensor          # [6, G, K]
     qx: Tensor              # [G, K], tile centre minus mean
     qy: Tensor
-    colors: Tensor          # [G, K, D + 1]; the last channel is 1, for alpha
+    colors: Tensor          # [G, K, D + 1]
     clamps: bool            # whether alpha can reach its clamp
 
 
@@ -104,7 +116,8 @@ def _lists(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, i
     C, N = opacities.shape
     tiles_x, tiles_y = tile_counts(width, height, tile)
     records = footprint.records(means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten()).T.contiguous()
-    return _Lists(ids, offsets[:-1], offsets.diff(), records, colors.reshape(-1, colors.shape[-1]), N if len(colors) < C else 0, alpha_max,
+    table = torch.nn.functional.pad(colors.reshape(-1, colors.shape[-1]), (0, 1), value=1.0)   # here, not for each hit
+    return _Lists(ids, offsets[:-1], offsets.diff(), records, table, N if len(colors) < C else 0, alpha_max,
                   (C, tiles_y, tiles_x), tile, footprint.monomials(tile, means2d.dtype, means2d.device))
 
 
@@ -149,28 +162,27 @@ def _weights(lists: _Lists, coefficients: Tensor, clamp: bool, light: Tensor, al
 
 def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
                  offsets: Tensor, width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
-    """As `blending.blend`, without autograd. Working memory beyond inputs and outputs: one number per pixel and channel, and constants."""
+    """As `blending.blend`, without autograd. Working memory beyond inputs and outputs: one number per pixel and channel, per splat its record
+    and colours, and constants."""
     lists = _lists(means2d, conics, opacities, colors, ids, offsets, width, height, tile, alpha_max)
     D = colors.shape[-1]
     light = _light(lists, width, height)
     image = light.new_zeros(len(light), D + 1, tile * tile)
     memory = _Memory(lists, 3)
 
-    def blend_group(piece: tuple[Tensor, int, int]) -> tuple[Tensor, Tensor]:
-        group = lists.group(*piece)
+    def blend_group(group: _Group) -> _Group:
         coefficients = footprint.coefficients(group.record, group.qx, group.qy)
         group_light = light.index_select(0, group.tiles)
         group_image = image.new_empty(len(group.tiles), D + 1, tile * tile)
         for part, (alpha, weight, T) in memory.blocks(group):
             _weights(lists, coefficients[part], group.clamps, group_light[part], alpha, weight, T)
             torch.bmm(group.colors[part].mT, weight.mT, out=group_image[part])
-        light.index_copy_(0, group.tiles, group_light)
-        return group.tiles, group_image
+        light.index_copy_(0, group.tiles, group_light)                                      # no other group has these tiles
+        image.index_add_(0, group.tiles, group_image)
+        return group
 
-    with workers(len(ids) >= WORTH_WORKERS) as ordered_map:
-        for groups in lists.rounds(light):
-            for tiles, group_image in ordered_map(blend_group, groups):
-                image.index_add_(0, tiles, group_image)
+    for _ in lists.run(blend_group, light):
+        pass
     full = to_image(image, lists.shape, width, height)
     # clones, as an op's results must not share memory, which views of size 1 would
     rendered, alphas = (x.clone(memory_format=torch.contiguous_format) for x in (full[..., :D], full[..., D]))
@@ -205,8 +217,7 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
     v_abs = means2d.new_zeros(2, C * N if absgrad else 0)
     memory = _Memory(lists, 5)
 
-    def backward_group(piece: tuple[Tensor, int, int]) -> tuple[_Group, Tensor, Tensor, list[Tensor]]:
-        group = lists.group(*piece)
+    def backward_group(group: _Group) -> tuple[_Group, Tensor, Tensor, list[Tensor]]:
         coefficients = footprint.coefficients(group.record, group.qx, group.qy)
         slopes = footprint.mean_slopes(group.record, group.qx, group.qy) if absgrad else ()
         group_light, group_rest, group_upstream = (v.index_select(0, group.tiles) for v in (light, rest, upstream))
@@ -217,8 +228,8 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
             torch.bmm(group_upstream[part].mT, group.colors[part].mT, out=v)                # g
             torch.bmm(group_upstream[part, :D], weight, out=v_color[part])
             _log_alpha_gradient(v, weight, T, product, group_rest[part])
-            if group.clamps:
-                v.masked_fill_(alpha >= alpha_max, 0.0)
+            if group.clamps:    # v = 0 where alpha is 0, as it is already, or alpha_max: a mask takes 20 times as long
+                torch.ops.aten.hardtanh_backward.grad_input(v, alpha, 0.0, alpha_max, grad_input=v)
             torch.matmul(lists.monomials, v, out=moments[part])
             for slope, sum_abs in zip(slopes, sums, strict=True):
                 torch.matmul(lists.monomials[:3].T, slope[part], out=T)
@@ -227,13 +238,11 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
         rest.index_copy_(0, group.tiles, group_rest)
         return group, footprint.coefficients_backward(group.record, group.qx, group.qy, moments), v_color, sums
 
-    with workers(len(ids) >= WORTH_WORKERS) as ordered_map:
-        for groups in lists.rounds(light):
-            for group, v_record, v_color, sums in ordered_map(backward_group, groups):
-                v_records.index_add_(1, group.splats, v_record.flatten(1))
-                v_colors.index_add_(1, group.rows, v_color.transpose(0, 1).reshape(D, -1))
-                for axis, sum_abs in enumerate(sums):
-                    v_abs[axis].index_add_(0, group.splats, sum_abs.flatten())
+    for group, v_record, v_color, sums in lists.run(backward_group, light):
+        v_records.index_add_(1, group.splats, v_record.flatten(1))
+        v_colors.index_add_(1, group.rows, v_color.transpose(0, 1).reshape(D, -1))
+        for axis, sum_abs in enumerate(sums):
+            v_abs[axis].index_add_(0, group.splats, sum_abs.flatten())
     v_means2d, v_conics, v_opacities = footprint.records_backward(conics.reshape(-1, 3), opacities.flatten(), v_records)
     return (v_means2d.view_as(means2d), v_conics.view_as(conics), v_opacities.view_as(opacities), v_colors.T.reshape(colors.shape),
             v_abs.T.reshape(C, -1, 2))
@@ -246,6 +255,10 @@ def _log_alpha_gradient(v: Tensor, weight: Tensor, T: Tensor, product: Tensor, r
     torch.cumsum(product, -1, out=product)                                                  # minus the rest behind each splat
     torch.neg(product[..., -1], out=rest)
     v.add_(product.div_(T.clamp_(min=TINY))).mul_(weight)
+
+
+def _next(steps: Iterator[R]) -> R | None:
+    return next(steps, None)
 
 
 def _light(lists: _Lists, width: int, height: int) -> Tensor:

@@ -12,14 +12,23 @@ import functools
 import os
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import TypeVar
+from typing import Protocol, TypeVar
 
 import torch
 
 T = TypeVar("T")
 R = TypeVar("R")
+
+
+class OrderedMap(Protocol):
+    """`function` of each item, in the order of the items. With `repeat` an item comes again after all others that are left, until its
+    result is None, which is not given: work in steps that depend on each other, as a function `next` of iterators, beside other such work.
+    """
+
+    def __call__(self, function: Callable[[T], R], items: Iterable[T], repeat: bool = False) -> Iterator[R]: ...
+
 
 _pools: dict[int, ThreadPoolExecutor] = {}
 _lock = threading.Lock()
@@ -28,7 +37,7 @@ if hasattr(os, "register_at_fork"):
 
 
 @contextlib.contextmanager
-def workers(worth: bool = True) -> Iterator[Callable[[Callable[[T], R], Sequence[T]], Iterator[R]]]:
+def workers(worth: bool = True) -> Iterator[OrderedMap]:
     """Gives a map over independent pieces, without autograd, on `torch.get_num_threads()` threads.
 
     Meanwhile the calling thread's own operations are single-threaded, too: after a parallel one, OpenMP's threads would spin for a
@@ -53,19 +62,32 @@ def map_chunks(function: Callable[[slice], R], n: int, size: int) -> list[R]:
         return list(ordered_map(function, [slice(i, i + size) for i in range(0, n, size)]))
 
 
-def _plain_map(function: Callable[[T], R], items: Sequence[T]) -> Iterator[R]:
-    for item in items:
-        yield _call(function, item)
+def _plain_map(function: Callable[[T], R], items: Iterable[T], repeat: bool = False) -> Iterator[R]:
+    queue = deque(items)
+    while queue:
+        item = queue.popleft()
+        result = _call(function, item)
+        if not repeat:
+            yield result
+        elif result is not None:
+            queue.append(item)
+            yield result
 
 
-def _pool_map(pool: ThreadPoolExecutor, threads: int, function: Callable[[T], R], items: Sequence[T]) -> Iterator[R]:
-    pending: deque[Future[R]] = deque()
-    for item in items:
-        pending.append(pool.submit(_call, function, item))
-        if len(pending) > threads + 1:                  # bounds the results that wait
-            yield pending.popleft().result()
-    while pending:
-        yield pending.popleft().result()
+def _pool_map(pool: ThreadPoolExecutor, threads: int, function: Callable[[T], R], items: Iterable[T], repeat: bool = False) -> Iterator[R]:
+    queue = deque(items)
+    pending: deque[tuple[T, Future[R]]] = deque()
+    while queue or pending:
+        while queue and len(pending) < threads + 2:     # bounds the results that wait
+            item = queue.popleft()
+            pending.append((item, pool.submit(_call, function, item)))
+        item, future = pending.popleft()
+        result = future.result()
+        if not repeat:
+            yield result
+        elif result is not None:
+            queue.append(item)                          # the order of pending and queue together is that of `_plain_map`
+            yield result
 
 
 def _call(function: Callable[[T], R], item: T) -> R:

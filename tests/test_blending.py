@@ -29,13 +29,13 @@ def lists(s: scenes.Splats2D, width: int, height: int, tile: int) -> reference.B
 
 
 def blend(function: Callable[..., Any], s: scenes.Splats2D, width: int, height: int, tile: int, alpha_max: float = ALPHA_MAX,
-          bins: reference.Bins | None = None) -> tuple[Tensor, Tensor]:
+          bins: reference.Bins | None = None, drop_last: bool = False) -> tuple[Tensor, Tensor]:
     """Through `ops.blend`, `reference.blend` or `plain.blend`."""
     if function is plain.blend:
-        return plain.blend(*s, width, height, alpha_max)
+        return plain.blend(*s, width, height, alpha_max, drop_last=drop_last)
     ids, offsets = lists(s, width, height, tile) if bins is None else bins
     probe = (None,) if function is ops.blend else ()
-    return function(*s[:5], *probe, ids, offsets, width, height, tile, alpha_max)
+    return function(*s[:5], *probe, ids, offsets, width, height, tile, alpha_max, drop_last)
 
 
 def differentiable(s: scenes.Splats2D) -> tuple[scenes.Splats2D, list[Tensor]]:
@@ -45,7 +45,7 @@ def differentiable(s: scenes.Splats2D) -> tuple[scenes.Splats2D, list[Tensor]]:
 
 
 def assert_all_three_agree(s: scenes.Splats2D, width: int, height: int, tile: int, alpha_max: float = ALPHA_MAX,
-                           backend: Backend | None = None) -> None:
+                           backend: Backend | None = None, drop_last: bool = False) -> None:
     """Values to 1e-13 and gradients to 1e-11 of the largest.
 
     The blocks evaluate log alpha as a polynomial about the tile's centre, whose terms reach some hundred: 1e2 eps. The backward
@@ -55,7 +55,7 @@ def assert_all_three_agree(s: scenes.Splats2D, width: int, height: int, tile: in
     for function in (plain.blend, reference.blend, ops.blend):
         mine = s if backend is None or function is not ops.blend else backend.put(s)
         mine, inputs = differentiable(mine)
-        outputs = blend(function, mine, width, height, tile, alpha_max)
+        outputs = blend(function, mine, width, height, tile, alpha_max, drop_last=drop_last)
         results.append((outputs, gradients(outputs, inputs)))
     (want, v_want), *others = results
     for got, v_got in others:
@@ -107,6 +107,15 @@ def test_saturation_within_a_chunk(backend: Backend, alpha_max: float) -> None:
     weight = blend(plain.blend, s, 12, 12, 8, alpha_max)[1]
     assert (1 - weight < 1e-4).float().mean() > 0.5                               # else nothing ends early
     assert_all_three_agree(s, 12, 12, 8, alpha_max, backend=backend)
+
+
+@pytest.mark.parametrize("channels", [3, 6])
+def test_the_peers_end_of_a_pixel(backend: Backend, channels: int) -> None:
+    """Lists of several chunks, in which pixels end at all places; and it is another result."""
+    s = scenes.splats2d(1, 200, 13, 11, size=(2.0, 9.0), opacity=(0.05, 1.0), channels=channels)
+    ours, peers = (blend(reference.blend, s, 13, 11, 8, drop_last=drop_last)[1] for drop_last in (False, True))
+    assert ((ours - peers > 1e-4) & (peers < 1 - 1e-4)).float().mean() > 0.3
+    assert_all_three_agree(s, 13, 11, 8, backend=backend, drop_last=True)
 
 
 @pytest.mark.parametrize(("count", "opacity"), [(300, (0.01, 0.3)), (300, (0.3, 1.0)), (64, (0.3, 1.0)), (65, (0.004, 0.02)),
@@ -364,9 +373,9 @@ def peaks(n: int, side: int) -> tuple[int, int]:
     v_image, v_alpha = torch.ones(1, side, side, 3, dtype=torch.float64), torch.ones(1, side, side, dtype=torch.float64)
     with torch.no_grad():
         with Peak() as forward:
-            outputs = reference.blend_blocks(*s[:5], *bins, side, side, 8, ALPHA_MAX)
+            outputs = reference.blend_blocks(*s[:5], *bins, side, side, 8, ALPHA_MAX, False)
         with Peak() as backward:
-            reference.blend_blocks_backward(*s[:5], *bins, *outputs, v_image, v_alpha, side, side, 8, ALPHA_MAX, True)
+            reference.blend_blocks_backward(*s[:5], *bins, *outputs, v_image, v_alpha, side, side, 8, ALPHA_MAX, False, True)
     return forward.peak // 8, backward.peak // 8
 
 

@@ -80,7 +80,7 @@ def channels(image: Tensor, depth: Tensor | None) -> Tensor:
     return image if depth is None else torch.cat([image, depth[..., None]], -1)
 
 
-def ours(golden: Golden, backend: Backend) -> tuple[Tensor, Tensor, list[Tensor], Tensor, Tensor]:
+def ours(golden: Golden, backend: Backend, drop_last: bool = False) -> tuple[Tensor, Tensor, list[Tensor], Tensor, Tensor]:
     """Image, alpha, leaves, zero screen offset and probe of the absolute gradient, through `rasterize`."""
     inputs = leaves(*(backend.put(golden[name]) for name in INPUTS))
     *splats, viewmats, Ks, background = inputs
@@ -88,7 +88,7 @@ def ours(golden: Golden, backend: Backend) -> tuple[Tensor, Tensor, list[Tensor]
                                  requires_grad=True)
                      for _ in range(2))
     r = rasterize(*splats, Camera(viewmats, Ks, golden.width, golden.height), background=background, depth=golden.depth,
-                  eps2d=golden.eps2d, alpha_max=golden.alpha_max, screen_offset=offset, absgrad=probe)
+                  eps2d=golden.eps2d, alpha_max=golden.alpha_max, drop_last=drop_last, screen_offset=offset, absgrad=probe)
     return channels(r.image, r.depth), r.alpha, inputs, offset, probe
 
 
@@ -157,18 +157,17 @@ def test_gradients_from_pixels_that_do_not_saturate_are_the_peers(golden: Golden
     assert_close(gradients_of(recorded_loss(golden, image, alpha, golden.calm), inputs, offset), peers(golden)[3], 1e-12)
 
 
-def test_gradients_are_the_recorded_ones(golden: Golden, backend: Backend) -> None:
-    """All pixels: to rounding where none saturates; else off by the splats that the peers drop.
-
-    Measured on the anisotropic scene, 324 of 16,640 pixels saturated: means 1.2e-3, quats 1.0e-3, scales 1.4e-3, opacities
-    1.1e-2, colors 5.8e-4, viewmats 6.7e-4, backgrounds 2.8e-3, means2d 1.6e-3 of the largest.
-    """
-    image, alpha, inputs, offset, _ = ours(golden, backend)
-    names = (*WITH_GRADIENT, "means2d")
-    saturated = bool(golden["saturated"].any())
-    bounds = dict(zip(names, (1.3e-3, 1.1e-3, 1.5e-3, 1.2e-2, 7e-4, 8e-4, 3e-3, 1.7e-3), strict=True))
-    for name, v in zip(names, gradients_of(recorded_loss(golden, image, alpha), inputs, offset), strict=True):
-        assert error(v, golden[f"f64_v_{name}"]) <= (bounds[name] if saturated else ROUNDING), name
+def test_with_the_peers_end_of_a_pixel_all_is_as_recorded(golden: Golden, backend: Backend) -> None:
+    """Images and gradients, where pixels saturate, too. Asked for: 1e-6 and 1e-5, and there 1.5e-4 and 1e-3. It is the file's rounding."""
+    image, alpha, inputs, offset, probe = ours(golden, backend, drop_last=True)
+    everywhere = torch.ones_like(golden["saturated"])
+    assert_rounds_to(image, golden["f64_render_colors"], everywhere)
+    assert_rounds_to(alpha, golden["f64_render_alphas"][..., 0], everywhere)
+    loss = recorded_loss(golden, image, alpha)
+    found = gradients_of(loss, inputs, offset)
+    assert_close(found, [golden[f"f64_v_{name}"] for name in (*WITH_GRADIENT, "means2d")], ROUNDING)
+    v_abs, = torch.autograd.grad(loss, probe)
+    assert error(v_abs, golden["v_means2d_abs"]) <= ROUNDING
 
 
 def test_where_pixels_saturate_we_are_closer_to_the_exact_sum_than_the_peers(golden: Golden, backend: Backend,
@@ -193,13 +192,6 @@ def test_where_pixels_saturate_we_are_closer_to_the_exact_sum_than_the_peers(gol
         assert 1e-3 < dropped.max() <= 9.3e-3
         assert (image[..., :3].cpu() - recorded).abs()[golden["saturated"]].max() <= 7.1e-3
         assert (exact[..., :3] - recorded).abs().max() > 10 * (exact[..., :3] - image[..., :3].cpu()).abs().max()
-
-
-def test_absolute_gradients_are_the_recorded_ones(golden: Golden, backend: Backend) -> None:
-    """Measured: rounding where nothing saturates, 8.1e-5 of the largest on the anisotropic scene."""
-    image, alpha, _, _, probe = ours(golden, backend)
-    v_abs, = torch.autograd.grad(recorded_loss(golden, image, alpha), probe)
-    assert error(v_abs, golden["v_means2d_abs"]) <= (9e-5 if golden["saturated"].any() else ROUNDING)
 
 
 def test_projection_is_the_recorded_one(golden: Golden, backend: Backend) -> None:

@@ -46,11 +46,11 @@ def guarded(tensor: Tensor | None) -> Tensor | None:
 
 
 def case(cameras: int, n: int, width: int, height: int, *, dtype: torch.dtype = torch.float64, device: str = "cpu",
-         **options: object) -> Case:
+         drop_last: bool = False, **options: object) -> Case:
     s = scenes.splats2d(cameras, n, width, height, **options)  # type: ignore[arg-type]
     bins = reference.bin_splats(s.means2d, s.radii, s.conics, s.opacities, s.depths, width, height, TILE)
     put = [None if x is None else guarded(x.to(dtype) if x.is_floating_point() else x).to(device) for x in s]
-    return Case(scenes.Splats2D(*put), reference.Bins(*(guarded(b).to(device) for b in bins)), width, height)
+    return Case(scenes.Splats2D(*put), reference.Bins(*(guarded(b).to(device) for b in bins)), width, height, drop_last)
 
 
 @pytest.fixture
@@ -70,6 +70,10 @@ CASES = {
     "saturated": {"cameras": 1, "n": 60, "width": 16, "height": 10, "channels": 3, "size": (4.0, 9.0), "opacity": (0.6, 0.999)},
     "saturated, many channels": {"cameras": 1, "n": 60, "width": 10, "height": 16, "channels": 5, "size": (4.0, 9.0),
                                  "opacity": (0.6, 0.999)},
+    "the peers' end of a pixel": {"cameras": 1, "n": 60, "width": 16, "height": 10, "channels": 3, "size": (4.0, 9.0), "opacity": (0.6, 0.999),
+                                 "drop_last": True},
+    "the peers' end of a pixel, many channels": {"cameras": 1, "n": 60, "width": 10, "height": 16, "channels": 5, "size": (4.0, 9.0),
+                                                "opacity": (0.6, 0.999), "drop_last": True},
     "one pixel": {"cameras": 1, "n": 3, "width": 1, "height": 1, "channels": 3},
     "no splats": {"cameras": 2, "n": 0, "width": 18, "height": 3, "channels": 3},
 }

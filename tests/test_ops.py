@@ -108,6 +108,7 @@ CASES: dict[str, tuple[Any, Callable[..., tuple[Any, ...]], dict[str, Any]]] = {
     "bin_splats_fixed, too few": (binning.bin_splats_fixed_op, lambda: (*bin_arguments(), 3), {}),
     "blend": (blending.blend_op, blend_arguments, {}),
     "blend, bare": (blending.blend_op, blend_arguments, {"background": False, "absgrad": False, "shared_colors": True}),
+    "blend, drop_last": (blending.blend_op, blend_arguments, {"drop_last": True}),
     "blend, N = 0": (blending.blend_op, blend_arguments, {"n": 0}),
     "blend_backward": (blending.blend_backward_op, blend_backward_arguments, {}),
     "blend_backward, bare": (blending.blend_backward_op, blend_backward_arguments,

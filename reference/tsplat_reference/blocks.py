@@ -53,6 +53,7 @@ class _Lists:
     colors: Tensor          # [C N or N, D + 1]; the last channel is 1, for alpha
     shared: int             # N if all cameras share the colours, else 0
     alpha_max: float
+    drop_last: bool
     shape: tuple[int, int, int]     # C, tiles_y, tiles_x
     tile: int
     monomials: Tensor       # [6, P]
@@ -112,12 +113,12 @@ class _Group(NamedTuple):
 
 
 def _lists(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ids: Tensor, offsets: Tensor, width: int, height: int,
-           tile: int, alpha_max: float) -> _Lists:
+           tile: int, alpha_max: float, drop_last: bool) -> _Lists:
     C, N = opacities.shape
     tiles_x, tiles_y = tile_counts(width, height, tile)
     records = footprint.records(means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten()).T.contiguous()
     table = torch.nn.functional.pad(colors.reshape(-1, colors.shape[-1]), (0, 1), value=1.0)   # here, not for each hit
-    return _Lists(ids, offsets[:-1], offsets.diff(), records, table, N if len(colors) < C else 0, alpha_max,
+    return _Lists(ids, offsets[:-1], offsets.diff(), records, table, N if len(colors) < C else 0, alpha_max, drop_last,
                   (C, tiles_y, tiles_x), tile, footprint.monomials(tile, means2d.dtype, means2d.device))
 
 
@@ -156,15 +157,19 @@ def _weights(lists: _Lists, coefficients: Tensor, clamp: bool, light: Tensor, al
     torch.cumprod(weight, -1, out=T)
     torch.div(T, weight, out=weight)                        # T in front: cheaper than a shifted copy, and 1 - alpha >= 1 - alpha_max
     weight[..., 0] = light
-    torch.threshold_(weight, TRANSMITTANCE_MIN, 0.0).mul_(alpha)
+    if lists.drop_last:     # weight where T is above the limit, else 0
+        torch.ops.aten.threshold_backward.grad_input(weight, T, TRANSMITTANCE_MIN, grad_input=weight)
+    else:
+        torch.threshold_(weight, TRANSMITTANCE_MIN, 0.0)
+    weight.mul_(alpha)
     light.copy_(T[..., -1])
 
 
 def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
-                 offsets: Tensor, width: int, height: int, tile: int, alpha_max: float) -> tuple[Tensor, Tensor]:
+                 offsets: Tensor, width: int, height: int, tile: int, alpha_max: float, drop_last: bool) -> tuple[Tensor, Tensor]:
     """As `blending.blend`, without autograd. Working memory beyond inputs and outputs: one number per pixel and channel, per splat its record
     and colours, and constants."""
-    lists = _lists(means2d, conics, opacities, colors, ids, offsets, width, height, tile, alpha_max)
+    lists = _lists(means2d, conics, opacities, colors, ids, offsets, width, height, tile, alpha_max, drop_last)
     D = colors.shape[-1]
     light = _light(lists, width, height)
     image = light.new_zeros(len(light), D + 1, tile * tile)
@@ -193,7 +198,7 @@ def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Ten
 
 def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
                           offsets: Tensor, image: Tensor, alphas: Tensor, v_image: Tensor, v_alphas: Tensor | None, width: int, height: int,
-                          tile: int, alpha_max: float, absgrad: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+                          tile: int, alpha_max: float, drop_last: bool, absgrad: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Closed-form gradients of `blend` with respect to means2d, conics, opacities and colors. (That of the background is the sum of
     (1 - alpha) dL/dimage.)
 
@@ -203,7 +208,7 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
 
     The fifth result is the absolute gradient `[C, N, 2]`: sum over pixels of |dL/dmean2d| per axis (AbsGS); empty unless asked for.
     """
-    lists = _lists(means2d, conics, opacities, colors, ids, offsets, width, height, tile, alpha_max)
+    lists = _lists(means2d, conics, opacities, colors, ids, offsets, width, height, tile, alpha_max, drop_last)
     C, N, D = *opacities.shape, colors.shape[-1]
     v_alphas = torch.zeros_like(alphas) if v_alphas is None else v_alphas
     if backgrounds is None:

@@ -112,7 +112,7 @@ def test_saturation_within_a_chunk(backend: Backend, alpha_max: float) -> None:
 @pytest.mark.parametrize("channels", [3, 6])
 def test_the_peers_end_of_a_pixel(backend: Backend, channels: int) -> None:
     """Lists of several chunks, in which pixels end at all places; and it is another result."""
-    s = scenes.splats2d(1, 200, 13, 11, size=(2.0, 9.0), opacity=(0.05, 1.0), channels=channels)
+    s = scenes.splats2d(1, 150, 13, 11, size=(1.0, 4.0), opacity=(0.5, 1.0), channels=channels)
     ours, peers = (blend(reference.blend, s, 13, 11, 8, drop_last=drop_last)[1] for drop_last in (False, True))
     assert ((ours - peers > 1e-4) & (peers < 1 - 1e-4)).float().mean() > 0.3
     assert_all_three_agree(s, 13, 11, 8, backend=backend, drop_last=True)

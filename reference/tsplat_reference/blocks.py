@@ -233,7 +233,7 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
             torch.bmm(group_upstream[part].mT, group.colors[part].mT, out=v)                # g
             torch.bmm(group_upstream[part, :D], weight, out=v_color[part])
             _log_alpha_gradient(v, weight, T, product, group_rest[part])
-            if group.clamps:    # v = 0 where alpha is 0, as it is already, or alpha_max: a mask takes 20 times as long
+            if group.clamps:    # v = 0 where alpha is 0, as it is already, or alpha_max: a comparison and a mask take several times as long
                 torch.ops.aten.hardtanh_backward.grad_input(v, alpha, 0.0, alpha_max, grad_input=v)
             torch.matmul(lists.monomials, v, out=moments[part])
             for slope, sum_abs in zip(slopes, sums, strict=True):

@@ -37,7 +37,6 @@ class FitConfig:
         "splats to start with at least; where there are fewer points, more are put around them", 0))
     sh_degree: int = field(default=3, metadata=_about("degree of the spherical harmonics of the colours", 0, MAX_SH_DEGREE))
     sh_warmup: float = field(default=0.1, metadata=_about("part of the steps in which the degree rises to that", 0, 1))
-    coarse: float = field(default=0.5, metadata=_about("part of the steps, the first, that compare at half the size of the photos", 0, 1))
     init_opacity: float = field(default=0.1, metadata=_about("opacity of the first splats", 1e-6, 1 - 1e-6))
     init_scale: float = field(default=1.0, metadata=_about("size of the first splats, in distances to their neighbours", 1e-6))
     antialiased: bool = field(default=False, metadata=_about("compensate the opacity of splats smaller than a pixel"))

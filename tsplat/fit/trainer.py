@@ -12,7 +12,6 @@ from pathlib import Path
 import torch
 
 from tsplat.fit.checkpoint import restore, save_checkpoint
-from tsplat.fit.coarse import at_step
 from tsplat.fit.config import FitConfig
 from tsplat.fit.drawing import draw, step_background
 from tsplat.fit.evaluation import Quality, evaluate, mean_quality
@@ -33,7 +32,7 @@ class Step:
     Args:
         number: steps done.
         photo: its name.
-        loss, psnr: of its render before the step (PSNR in dB), at the size that the step compares.
+        loss, psnr: of its render before the step (PSNR in dB).
         gaussians: the scene after the step. A callback may look at it, not change it.
     """
 
@@ -125,9 +124,8 @@ def train_step(state: FitState, capture: Capture, config: FitConfig) -> Step:
     device = gaussians.means.device
     view = state.next_view(capture.train)
     background = step_background(config, state.generator).to(device)
-    photo, camera = at_step(config, state.step, capture.images[view], capture.camera(view))
-    target = target_of(photo.to(device), background, masked=capture.masked)
-    rendering = draw(gaussians, camera.to(device), background, sh_degree=sh_degree_at(config, state.step),
+    target = target_of(capture.images[view].to(device), background, masked=capture.masked)
+    rendering = draw(gaussians, capture.camera(view).to(device), background, sh_degree=sh_degree_at(config, state.step),
                      antialiased=config.antialiased)
     loss = photo_loss(rendering.image, target, config.ssim_weight)
     state.adam.zero_grad()

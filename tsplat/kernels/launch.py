@@ -103,12 +103,12 @@ def _splats(block: int, num_warps: int) -> dict[str, int]:
 
 
 # project, harmonics: a splat per thread, so that no thread repeats another's work. As few warps as can be where there are sums over the block:
-# one needs no step from warp to warp, and sums of more blocks to add up are a percent or two of what is read anyway. (project_backward in one
-# warp is compiled for 96 registers on sm_89, and spills.) pick: a count of BLOCK must fit a byte. blend: a warp takes 4 tiles (8 of 64 lanes).
-# features: splats and channels of a matrix product. The NVIDIA columns but for bin and features are the fastest on an H100.
+# one needs no step from warp to warp, and sums of more blocks to add up are a percent or two of what is read anyway. (project_backward in two
+# warps spills on sm_120.) pick: a count of BLOCK must fit a byte. blend: a warp takes 4 tiles (8 of 64 lanes). features: splats and channels
+# of a matrix product; in 4 warps the forward was faster on an H100, but spills on sm_120. All columns but NVIDIA's are untimed.
 LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "project": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
-    "project_backward": {"nvidia": _splats(64, 2), "cdna": _splats(64, 1), "rdna": _splats(32, 1)},
+    "project_backward": {"nvidia": _splats(128, 4), "cdna": _splats(64, 1), "rdna": _splats(32, 1)},
     "harmonics": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
     "harmonics_backward": {"nvidia": _splats(32, 1), "cdna": _splats(64, 1), "rdna": _splats(32, 1)},
     "bin": {"nvidia": _splats(128, 4), "cdna": _splats(64, 1), "rdna": _splats(64, 2)},
@@ -116,7 +116,7 @@ LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "records": {"nvidia": _splats(32, 1), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
     "blend": {family: {"num_warps": 1} for family in FAMILIES},
     "blend_backward": {family: {"num_warps": 1} for family in FAMILIES},
-    "features": {"nvidia": {"K": 16, "DB": 64, "num_warps": 4}, "cdna": {"K": 16, "DB": 32, "num_warps": 8},
+    "features": {"nvidia": {"K": 16, "DB": 64, "num_warps": 8}, "cdna": {"K": 16, "DB": 32, "num_warps": 8},
                  "rdna": {"K": 16, "DB": 32, "num_warps": 8}},
     "features_colors_backward": {"nvidia": {"K": 16, "DB": 32, "num_warps": 4}, "cdna": {"K": 16, "DB": 32, "num_warps": 4},
                                  "rdna": {"K": 16, "DB": 16, "num_warps": 8}},

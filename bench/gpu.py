@@ -95,8 +95,9 @@ def fixed_scenes(data: Path, quick: bool) -> list[tuple[str, Scene, int]]:
         for size, (width, height) in list(SIZES.items())[:1 if quick else None]:
             for channels in (3,) if quick or n > 1_000_000 else (3, 32, 128):
                 scene = random_scene(n, width, height)
-                colors = torch.rand(n, channels, generator=torch.Generator().manual_seed(0))
-                scenes.append((f"random {n // 1000}k, {size}", scene._replace(colors=colors, background=torch.rand(channels)), channels))
+                g = torch.Generator().manual_seed(0)
+                scene = scene._replace(colors=torch.rand(n, channels, generator=g), background=torch.rand(channels, generator=g))
+                scenes.append((f"random {n // 1000}k, {size}", scene, channels))
     for path in sorted((data / "data" / "splats").glob("*.ply")):
         if ".compressed" not in path.name:
             scenes.append((path.stem, trained(path), 3))

@@ -1,6 +1,6 @@
 """Times of each kernel's stage over candidates for its launch constants, for the table in `tsplat/kernels/launch.py`.
 
-    python bench/sweep.py                    # every kernel; `*` marks what stands in the table, `!` what would be faster
+    python bench/sweep.py                    # all but the harmonics; `*` marks what stands in the table, `!` what is faster
     python bench/sweep.py --kernels blend features --splats 1000000 --size 4K
 
 Without a GPU it says so and exits with 2.
@@ -52,8 +52,9 @@ def main() -> int:
     print(f"{torch.cuda.get_device_name()}, {args.splats} splats, {args.size}\n\n| kernel | constants | stage, ms | |\n| --- | --- | --- | --- |")
     for kernel in args.kernels:
         stage, channels, candidates = CANDIDATES[kernel]
-        colors = torch.rand(args.splats, channels, generator=torch.Generator().manual_seed(0))
-        calls, _, _ = stage_calls(to(scene._replace(colors=colors, background=torch.rand(channels)), torch.device("cuda")))
+        g = torch.Generator().manual_seed(0)
+        some = scene._replace(colors=torch.rand(args.splats, channels, generator=g), background=torch.rand(channels, generator=g))
+        calls, _, _ = stage_calls(to(some, torch.device("cuda")))
         stands = LAUNCHES[kernel][family]
         tried = [*(c for c in candidates if only.items() <= c.items()), stands]
         times = sorted((time(calls[stage], LAUNCHES[kernel], family, c, args.times), list(c.items()), c == stands) for c in tried)

@@ -42,14 +42,14 @@ def test_sizes_that_only_a_gpu_can_do(cameras: int, n: int, width: int, height: 
 
 
 def test_tens_of_millions_of_hits() -> None:
-    s = scenes.splats2d(1, 3000, 1920, 1080, size=(400.0, 900.0), opacity=(0.004, 0.006))
+    s = scenes.splats2d(1, 5000, 1920, 1080, size=(400.0, 900.0), opacity=(0.004, 0.006))
     put = [x.cuda() for x in (s.means2d, s.radii, s.conics, s.opacities, s.depths)]
     ids, offsets = ops.bin_splats(*put, 1920, 1080, 8)
     assert len(ids) == int(offsets[-1]) > 2e7
     lengths = offsets.diff()
-    assert int(lengths.max()) <= 3000
-    rank = torch.empty(3000, dtype=torch.int64, device="cuda").index_copy_(0, put[4][0].sort(stable=True).indices, torch.arange(3000, device="cuda"))
-    order = rank[ids.long()] + torch.repeat_interleave(lengths) * 3000
+    assert int(lengths.max()) <= 5000
+    rank = torch.empty(5000, dtype=torch.int64, device="cuda").index_copy_(0, put[4][0].sort(stable=True).indices, torch.arange(5000, device="cuda"))
+    order = rank[ids.long()] + torch.repeat_interleave(lengths) * 5000
     assert bool((order.diff() > 0).all())                   # in each list once, and front to back
 
 

@@ -427,7 +427,9 @@ class _Scene:
         target = current_target()
         self.common = {"ALPHA_MAX": alpha_max, "DROP_LAST": drop_last, "log2_alpha": footprint.log2_alpha, "enable_fp_fusion": True}
         lanes, ptx = target.lanes, target.ptx and means2d.dtype == torch.float32
-        self.lane_x = _lane_x(lanes, means2d.dtype, means2d.device)
+        # what is made while a CUDA graph is captured has no numbers until its replay: not to be kept
+        capturing = means2d.is_cuda and torch.cuda.is_current_stream_capturing()
+        self.lane_x = (_lane_x.__wrapped__ if capturing else _lane_x)(lanes, means2d.dtype, means2d.device)
         self.blocks = self.C * ceil_div(self.grid[0], 2) * ceil_div(self.grid[1], lanes // (2 * tile))
         self.warp = {**self.common, "D": self.D, "LANES": lanes, "PTX": ptx}
         self.block = {**self.common, "P": tile * tile, "PRECISION": "tf32x3" if ptx else "ieee"}
@@ -476,9 +478,10 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
         if deterministic:
             sums = means2d.new_zeros(s.R + 1, SUMS.value).index_add_(0, s.ids.long(), sums)
     else:
-        v_weights, rest = torch.zeros_like(alphas) if v_alphas is None else v_alphas, torch.einsum("chwd,chwd->chw", image, v_image)
+        # not einsum: a setting of torch may round its products to TF32, and the kernel takes small differences of these
+        v_weights, rest = torch.zeros_like(alphas) if v_alphas is None else v_alphas, (image * v_image).sum(-1)
         if backgrounds is not None:
-            behind = torch.einsum("chwd,cd->chw", v_image, backgrounds)
+            behind = (v_image * backgrounds[:, None, None]).sum(-1)
             v_weights, rest = v_weights - behind, rest - behind
         if v_alphas is not None:
             rest = rest + alphas * v_alphas

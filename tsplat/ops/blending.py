@@ -75,7 +75,7 @@ def _backward(ctx: Any, v_image: Tensor | None, v_alphas: Tensor | None) -> tupl
     tensors = ctx.saved_tensors
     v_image = torch.zeros_like(tensors[7]) if v_image is None else v_image.contiguous()
     *v_inputs, v_abs = blend_backward_op(*tensors, v_image, None if v_alphas is None else v_alphas.contiguous(), *ctx.options, ctx.absgrad)
-    v_backgrounds = torch.einsum("chwd,chw->cd", v_image, 1 - tensors[8]) if ctx.needs_input_grad[4] else None
+    v_backgrounds = (v_image * (1 - tensors[8])[..., None]).sum((1, 2)) if ctx.needs_input_grad[4] else None
     return *v_inputs, v_backgrounds, v_abs if ctx.absgrad else None, *[None] * 7
 
 

@@ -181,7 +181,7 @@ def measure(scene: Scene, copy_GBps: float) -> dict[str, Any]:
     before = torch.cuda.memory_allocated()
     both()
     N = len(scene.means)
-    floors = {"project": 4 * (14 * N + 11 * visible), "bin": 24 * visible + 3 * 12 * hits,
+    floors = {"project": 4 * (14 * N + 11 * visible), "bin": 40 * visible + 4 * hits,
               "blend": 52 * hits + 4 * (scene.colors.shape[1] + 1) * width * height}
     row: dict[str, Any] = {"ms": ms, "peak_MiB": (torch.cuda.max_memory_allocated() - before) / 2**20, "visible": visible, "hits": hits,
                            "share_of_memory_floor": {k: v / copy_GBps / 1e6 / ms[k][0] for k, v in floors.items()}}

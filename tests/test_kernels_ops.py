@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 import scenes
 import torch
+from backends import KERNELS, OPS
 from compare import assert_close
 from torch import Tensor
 from torch.library import opcheck
@@ -21,27 +22,16 @@ triton = pytest.importorskip("triton", reason="Triton is not installed here")
 
 from tsplat.kernels import launch  # noqa: E402
 
-OPS = [getattr(importlib.import_module(f"tsplat.ops.{module}"), name) for module, name in (
-    ("projection", "project_op"), ("projection", "project_backward_op"), ("harmonics", "harmonics_op"),
-    ("harmonics", "harmonics_backward_op"), ("binning", "bin_splats_op"), ("blending", "blend_op"), ("blending", "blend_backward_op"))]
 DEVICE = "cuda" if torch.cuda.is_available() else "cpu"
 WIDTH, HEIGHT = 19, 13
 
 
-@contextlib.contextmanager
-def kernels() -> Iterator[None]:
-    """The ops run Triton, also on CPU tensors."""
-    with contextlib.ExitStack() as stack:
-        for op in OPS:
-            stack.enter_context(op.set_kernel_enabled("cpu", False))
-        yield
-
-
-def render(*inputs: Tensor, width: int = WIDTH, height: int = HEIGHT) -> tuple[Tensor, Tensor, Tensor]:
+def render(*inputs: Tensor, width: int = WIDTH, height: int = HEIGHT, capacity: int | None = None
+           ) -> tuple[Tensor, Tensor, Tensor]:
     """Everything at once: SH colours, a batch of cameras, background, depth, antialiasing."""
     means, quats, scales, opacities, sh, viewmats, Ks, background = inputs
     r = tsplat.rasterize(means, quats, scales, opacities, sh, tsplat.Camera(viewmats, Ks, width, height), sh_degree=2,
-                         background=background, depth="expected", antialiased=True, tile=8)
+                         background=background, depth="expected", antialiased=True, tile=8, capacity=capacity)
     assert r.depth is not None
     return r.image, r.alpha, r.depth
 
@@ -61,14 +51,14 @@ def values_and_gradients(function: Callable[..., tuple[Tensor, ...]], leaves: li
 def test_images_and_all_gradients_are_those_of_the_reference() -> None:
     """To 1e-11 of the largest: rounding, divided by a transmittance of 1e-2, and by the alpha of expected depth."""
     want = values_and_gradients(render, inputs(device="cpu"))
-    with kernels():
+    with KERNELS.active():
         got = values_and_gradients(render, inputs())
     assert_close(got[0], want[0], 1e-11)
     assert_close(got[1], want[1], 1e-11)
 
 
 def test_gradcheck_on_the_kernels_themselves() -> None:
-    with kernels():
+    with KERNELS.active():
         assert torch.autograd.gradcheck(lambda *x: render(*x, width=9, height=7), inputs(3, cameras=1), fast_mode=True)
 
 
@@ -79,7 +69,7 @@ def test_second_derivatives() -> None:
     def image(means: Tensor, opacities: Tensor) -> Tensor:
         return render(means, *leaves[1:3], opacities, *leaves[4:], width=9, height=7)[0]
 
-    with kernels():
+    with KERNELS.active():
         assert torch.autograd.gradgradcheck(image, (leaves[0], leaves[3]), fast_mode=True)
 
 
@@ -87,7 +77,7 @@ def test_strided_upstream_gradients() -> None:
     leaves = inputs()
     reference = inputs(device="cpu")
     want = torch.autograd.grad(render(*reference)[0].sum(), reference)
-    with kernels():
+    with KERNELS.active():
         got = torch.autograd.grad(render(*leaves)[0].sum(), leaves)
     assert_close([g.cpu() for g in got], want, 1e-11)
 
@@ -95,7 +85,7 @@ def test_strided_upstream_gradients() -> None:
 @pytest.mark.parametrize("dynamic", [False, True])
 def test_compiles_whole(dynamic: bool) -> None:
     compiled = torch.compile(render, fullgraph=True, dynamic=dynamic, backend="aot_eager")
-    with kernels():
+    with KERNELS.active():
         for n in (5, 7) if dynamic else (6,):
             got, want = values_and_gradients(compiled, inputs(n)), values_and_gradients(render, inputs(n))
             assert_close([*got[0], *got[1]], [*want[0], *want[1]], 1e-12)
@@ -104,9 +94,10 @@ def test_compiles_whole(dynamic: bool) -> None:
 def test_opcheck_of_every_op() -> None:
     calls: dict[str, tuple[Any, ...]] = {}
     leaves = inputs(4)
-    with kernels():
+    with KERNELS.active():
         with record(calls):
             values_and_gradients(render, leaves)
+            render(*leaves, capacity=200)
         assert set(calls) == {op.custom._qualname for op in OPS}
         for op in OPS:
             opcheck(op.custom, calls[op.custom._qualname], test_utils=("test_schema", "test_faketensor"))
@@ -133,7 +124,7 @@ def test_nothing_to_see(n: int) -> None:
     leaves = inputs(n)
     with torch.no_grad():
         leaves[0][:, 2].fill_(-5.0)
-    with kernels():
+    with KERNELS.active():
         outputs, gradients = values_and_gradients(render, leaves)
     assert_close(outputs[0], leaves[7].detach().cpu().expand_as(outputs[0]), 1e-15)
     assert all(not bool(g.any()) for g in gradients[:5])

@@ -68,7 +68,7 @@ class Rendering(NamedTuple):
 def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, colors: Tensor, camera: Camera, *,
               sh_degree: int | None = None, covars: Tensor | None = None, background: Tensor | None = None,
               depth: DepthMode | None = None, antialiased: bool = False, eps2d: float = EPS2D, alpha_max: float = ALPHA_MAX, drop_last: bool = False,
-              screen_offset: Tensor | None = None, absgrad: Tensor | None = None, tile: int | None = None, capacity: int | None = None
+              screen_offset: Tensor | None = None, absgrad: Tensor | None = None, tile: int = TILE, capacity: int | None = None
               ) -> Rendering:
     """Render N Gaussians (3D Gaussian Splatting, sections 4 and 6).
 
@@ -103,8 +103,6 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
         ValueError, TypeError: naming the argument, what came and what is expected.
         NotImplementedError: on a GPU where Triton is not installed, and for forward-mode derivatives.
     """
-    if tile is None:
-        tile = TILE
     _check(means, quats, scales, opacities, colors, camera, sh_degree, covars, background, depth, eps2d, alpha_max, screen_offset, absgrad,
            tile, capacity)
     C, width, height = len(camera), camera.width, camera.height

@@ -58,7 +58,7 @@ def test_same_seed_same_splats(capture: Capture, config: Make) -> None:
 def test_random_start_is_where_the_cameras_look(capture: Capture, config: Make) -> None:
     capture.points = None
     low, high = (torch.tensor(corner) for corner in view_cube(capture))
-    torch.testing.assert_close((low + high) / 2, torch.tensor([0.0, -0.35, 0.0]), atol=0.02, rtol=0)      # the target of all
+    torch.testing.assert_close((low + high) / 2, torch.tensor([0.0, -0.35, 0.0]), atol=1e-3, rtol=0)      # the target of all, but for the ridge
     assert 1 < (high - low)[0] / 2 < 2
     splats = initial_gaussians(capture, config(splats=100), generator())
     assert len(splats) == 100
@@ -72,4 +72,4 @@ def test_cube_of_parallel_cameras(capture: Capture, count: int) -> None:
     capture.Ks, capture.width, capture.height = capture.Ks[:count], capture.width[:count], capture.height[:count]
     low, high = (torch.tensor(corner) for corner in view_cube(capture))
     assert (low < high).all()
-    torch.testing.assert_close((low + high) / 2, torch.tensor([(count - 1) / 2, 0.0, capture.extent]), atol=1e-3, rtol=1e-3)
+    torch.testing.assert_close((low + high) / 2, torch.tensor([(count - 1) / 2, 0.0, capture.extent]), atol=1e-6, rtol=1e-6)     # float32

@@ -55,7 +55,7 @@ def test_adam_moves_by_the_rates() -> None:
     adam.step()
     for name, parameter in splats.named_parameters():
         expected = torch.full_like(parameter, -rates[name])              # the first step of Adam is its rate
-        torch.testing.assert_close(parameter.detach() - before[name], expected, atol=2e-6, rtol=1e-3)
+        torch.testing.assert_close(parameter.detach() - before[name], expected, atol=2e-6, rtol=1e-5)     # parameters of up to 16, rounded twice
 
 
 def test_adam_of_no_splats() -> None:

@@ -21,7 +21,7 @@ class Op:
     """An op in two forms, made of the same functions: one in the dispatcher, and a short way for eager calls.
 
     Compilers, transforms, autocast, modes and tensor subclasses see a custom op. Where there is none of these, a call goes to the functions
-    at once, with gradients through an autograd function: 10 us of Python instead of 90, and 3 instead of 20 where no gradient is needed.
+    at once, with gradients through an autograd function: 18 us of Python instead of 90, and 6 instead of 21 where no gradient is needed.
 
     Args:
         name: in the dispatcher.

@@ -6,5 +6,8 @@ from tsplat.rasterize import Rendering as Rendering
 from tsplat.rasterize import rasterize as rasterize
 from tsplat.scene import Gaussians as Gaussians
 from tsplat.scene import load_capture as load_capture
+from tsplat.spheres import Hits as Hits
+from tsplat.spheres import SphereRendering as SphereRendering
+from tsplat.spheres import render_spheres as render_spheres
 
 __version__ = "0.1.0"

@@ -14,3 +14,14 @@ from tsplat_reference.projection import ProjectionGradients as ProjectionGradien
 from tsplat_reference.projection import covariances as covariances
 from tsplat_reference.projection import project as project
 from tsplat_reference.projection import project_backward as project_backward
+from tsplat_reference.sphere_blocks import SphereGradients as SphereGradients
+from tsplat_reference.sphere_blocks import background_gradients as background_gradients
+from tsplat_reference.sphere_blocks import blend_sphere_blocks as blend_sphere_blocks
+from tsplat_reference.sphere_blocks import blend_sphere_blocks_backward as blend_sphere_blocks_backward
+from tsplat_reference.sphere_blocks import softmax_gradient as softmax_gradient
+from tsplat_reference.sphere_tracking import hit_weights as hit_weights
+from tsplat_reference.sphere_tracking import nearest_hits as nearest_hits
+from tsplat_reference.spheres import Outlines as Outlines
+from tsplat_reference.spheres import SphereImages as SphereImages
+from tsplat_reference.spheres import blend_spheres as blend_spheres
+from tsplat_reference.spheres import outlines as outlines

@@ -45,7 +45,7 @@ def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ba
         k = torch.arange(int(counts[tiles].max()), device=ids.device)
         valid = k < counts[tiles, None]                                                     # [T, K]
         splat = ids[torch.where(valid, offsets[tiles, None] + k, 0)].long() if len(ids) else valid.long()
-        px, py = _pixel_centers(tiles, shape, tile, means2d.dtype)                          # [T, P, 1]
+        px, py = pixel_centers(tiles, shape, tile, means2d.dtype)                          # [T, P, 1]
         mx, my = means2d.reshape(-1, 2)[splat][:, None].unbind(-1)                          # [T, 1, K]
         alpha = footprint.log_alpha(px - mx, py - my, conics.reshape(-1, 3)[splat][:, None], opacities.reshape(-1)[splat][:, None])
         alpha = alpha.exp().clamp_max(alpha_max)
@@ -77,7 +77,7 @@ def to_tiles(image: Tensor, tile: int) -> Tensor:
     return image.view(C, tiles_y, tile, tiles_x, tile, D).permute(0, 1, 3, 5, 2, 4).reshape(-1, D, tile * tile)
 
 
-def _pixel_centers(tiles: Tensor, shape: tuple[int, int, int], tile: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+def pixel_centers(tiles: Tensor, shape: tuple[int, int, int], tile: int, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
     """X and y `[T, P, 1]` of the pixel centres of tiles `[T]`."""
     p = torch.arange(tile * tile, device=tiles.device)
     x = (tiles % shape[2] * tile)[:, None] + p % tile

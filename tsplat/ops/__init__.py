@@ -5,3 +5,6 @@ from tsplat.ops.binning import bin_splats_fixed as bin_splats_fixed
 from tsplat.ops.blending import blend as blend
 from tsplat.ops.harmonics import harmonics as harmonics
 from tsplat.ops.projection import project as project
+from tsplat.ops.spheres import blend_spheres as blend_spheres
+from tsplat.ops.spheres import nearest_hits as nearest_hits
+from tsplat.ops.spheres import outlines as outlines

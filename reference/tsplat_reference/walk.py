@@ -1,0 +1,107 @@
+"""The lists of all tiles, walked front to back in chunks, for many tiles at a time and on all cores, in memory that has a bound."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple, TypeVar
+
+import torch
+from torch import Tensor
+
+from tsplat_reference.parallel import workers
+
+R = TypeVar("R")
+
+CHUNK = 64
+"""Splats of a tile per chunk. Finished pixels end with it, so more would waste work; fewer would pay the calls more often."""
+BLOCK = 1 << 18
+"""Pairs in a block: its buffers of this size, 5 MB in float32 where there are five, are the working set of a thread. Smaller ones fit closer
+caches, but then the calls cost more than that gains (measured from 2^15 to 2^19)."""
+GROUP = 1 << 15
+"""Hits of a group of blocks, whose small operations (gathering, coefficients, scattering) are done together, by one thread: about 60
+numbers per hit, 8 MB in float32. With more than 8 channels a group has fewer hits."""
+GROUP_TILES = 128
+"""Where there are few tiles: no smaller groups than this."""
+WORTH_WORKERS = 1 << 18
+"""Hits from which worker threads gain: at 70k, two threads take 1.1 times as long as one; at 700k, 0.65 times."""
+
+
+class Chunk(NamedTuple):
+    """Splats begin..begin + k of G tiles.
+
+    tiles: `[G]`. splats: `[G K]`, int64, as index_add is 20 times slower with int32. padding: `[G, K]`, beyond the end of a list.
+    """
+
+    tiles: Tensor
+    begin: int
+    k: int
+    splats: Tensor
+    padding: Tensor
+
+
+@dataclass(frozen=True)
+class TileLists:
+    """The splats of all tiles: ids int32 `[M]`, starts and counts int64 `[tiles]`, shape (C, tiles_y, tiles_x), and the side of a tile."""
+
+    ids: Tensor
+    starts: Tensor
+    counts: Tensor
+    shape: tuple[int, int, int]
+    tile: int
+
+    def run(self, function: Callable[[Chunk], R], alive: Callable[[Tensor, int], Tensor | None], channels: int) -> Iterator[R]:
+        """The results of `function` of all that is to do, in an order that the number of threads does not change.
+
+        `alive(tiles, begin)` says which tiles need their splats from `begin` on (None: all). Groups of tiles go front to back beside each
+        other, each at its own pace: no core waits for the slowest group of a round.
+        """
+        tiles = self.counts.sort(descending=True, stable=True).indices[:int((self.counts > 0).sum())]     # longest lists first
+        size = GROUP * 9 // (CHUNK * max(9, channels))
+        size = max(1, min(size, max(GROUP_TILES, -(-len(tiles) // 8))))                     # some groups for each core
+        strands = [map(function, self._chunks(some, alive)) for some in torch.split(tiles, size)]
+        with workers(int(self.counts.sum()) >= WORTH_WORKERS) as ordered_map:
+            yield from (result for result in ordered_map(_next, strands, repeat=True) if result is not None)
+
+    def centers(self, tiles: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+        """X and y `[G]` of the centres of tiles, in pixels."""
+        return ((tiles % self.shape[2] * self.tile).to(dtype) + self.tile / 2,
+                (tiles // self.shape[2] % self.shape[1] * self.tile).to(dtype) + self.tile / 2)
+
+    def _chunks(self, tiles: Tensor, alive: Callable[[Tensor, int], Tensor | None]) -> Iterator[Chunk]:
+        """The splats of a group of tiles, front to back; tiles that have or need no more drop out."""
+        counts = self.counts[tiles]
+        begin = 0
+        while len(tiles):
+            k = min(CHUNK, int(counts[0]) - begin)
+            at = (self.starts[tiles] + begin)[:, None] + torch.arange(k)                    # [G, K]
+            padding = torch.arange(begin, begin + k) >= counts[:, None]
+            splats = self.ids.index_select(0, at.clamp_(max=len(self.ids) - 1).flatten()).long()
+            yield Chunk(tiles, begin, k, splats, padding)
+            begin += CHUNK
+            left = counts > begin
+            needed = alive(tiles, begin)
+            live = (left if needed is None else left & needed).nonzero().squeeze(-1)
+            tiles, counts = tiles.index_select(0, live), counts.index_select(0, live)
+
+
+class Memory:
+    """Scratch memory for blocks: so many arrays `[B, P, K]`, which the blocks of a group, and then other groups, reuse."""
+
+    def __init__(self, like: Tensor, pixels: int, channels: int, buffers: int) -> None:
+        self.like, self.pixels, self.channels = like, pixels, channels
+        self.shape = buffers, max(BLOCK, pixels * CHUNK)
+        self.free: list[Tensor] = []
+
+    def blocks(self, g: int, k: int) -> Iterator[tuple[slice, tuple[Tensor, ...]]]:
+        """Blocks of a group of g tiles with k splats: their rows, and the arrays, contiguous."""
+        memory = self.free.pop() if self.free else self.like.new_empty(self.shape)
+        tiles = max(1, BLOCK // (self.pixels * max(k, self.channels)))                      # many channels: they set the working set
+        for i in range(0, g, tiles):
+            b = min(tiles, g - i)
+            yield slice(i, i + b), memory[:, :b * self.pixels * k].view(-1, b, self.pixels, k).unbind(0)
+        self.free.append(memory)
+
+
+def _next(steps: Iterator[R]) -> R | None:
+    return next(steps, None)

@@ -21,7 +21,6 @@ from tsplat_reference.camera import join_intrinsics, split_intrinsics
 from tsplat_reference.spheres import SphereImages
 from tsplat_reference.walk import Chunk, Memory, TileLists
 
-
 MISSED = 1e30
 """|c x m|^2 of padding: more than any |m|^2, so that no ray hits it."""
 

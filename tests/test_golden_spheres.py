@@ -112,9 +112,11 @@ def test_nearest_hits(shared: Path, backend: Backend, name: str) -> None:
     assert hits is not None
     there, got = ids >= 0, hits.depths.detach().cpu()
     assert torch.equal(hits.ids.cpu() >= 0, there)
-    # computed in float32 there: at an outline h = sqrt(R^2 - q^2) is known to the root of its eps, times R/D = 0.1
-    assert error(got[there], depths[there]) <= 4e-5
-    clear = ~((got.diff(dim=-1) < 1e-5).any(-1))        # pixels in which rounding cannot have changed the order
+    # computed in float32 there: of q^2 = |c|^2 - a^2 some 4 eps |c|^2 is not known, at an outline nor is the root of that of h = sqrt(R^2 - q^2)
+    unknown, distance, radius = 4 * ROUNDING * 16, 4, 0.5
+    assert error(got[there], depths[there]) <= unknown**0.5 / distance
+    assert float((got - depths)[there].abs().median()) <= unknown / radius
+    clear = ~((got.diff(dim=-1) < 1e-4).any(-1))        # pixels in which rounding cannot have changed the order
     assert float(clear.double().mean()) > 0.99
     assert torch.equal(hits.ids.cpu().long()[clear], ids.long()[clear])
 

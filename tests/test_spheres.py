@@ -12,11 +12,12 @@ import scenes
 import torch
 import tsplat_reference as reference
 from backends import Backend
-from compare import assert_close, assert_same_bits, gradients, leaves, strided, threads
+from compare import Peak, assert_close, assert_same_bits, gradients, leaves, strided, threads
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
+from tsplat_reference import walk
 
 import tsplat
 from tsplat import Camera, ops
@@ -350,6 +351,34 @@ def test_float32_against_float64() -> None:
     off = (results[1].image.double() - results[0].image).abs()
     assert float(off.quantile(0.99)) < 4 * 6e-8 * 6 / 0.2 + 6e-8 / 0.05 * 10
     assert float(off.max()) < 1e-3
+
+
+def peaks(n: int, side: int) -> int:
+    """The peak of forward and backward in numbers of 8 bytes, with every sphere on every tile; on one thread."""
+    s = scenes.spheres(n, size=(4.0, 5.0), depth=(7.0, 8.0), spread=0.0)
+    K = torch.tensor([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1]], dtype=torch.float64)
+    rest = (s.positions[None], s.radii[None], s.opacities[None], s.features[None], torch.ones(1, 3, dtype=torch.float64),
+            torch.tensor(0.1, dtype=torch.float64), K[None])
+    outline = reference.outlines(rest[0], rest[1], K[None], side, side, "pinhole", NEAR, FAR)
+    bins = reference.bin_splats(outline.means2d, outline.radii, outline.conics, outline.opacities, outline.depths, side, side, 8)
+    assert len(bins.ids) == n * (side // 8) ** 2
+    with torch.no_grad(), Peak() as peak:
+        images = reference.blend_sphere_blocks(*rest, *bins, side, side, 8, "pinhole", NEAR, FAR, 1e-6, False, False, 0.0)
+        reference.blend_sphere_blocks_backward(*rest, *bins, None, images, images.image, None, None, side, side, 8, "pinhole", NEAR, FAR, 1e-6,
+                                               False, True)
+    return peak.peak // 8
+
+
+def test_working_memory_does_not_grow_with_the_pairs_of_pixels_and_spheres(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Some numbers for each sphere, for each pixel and channel, and constants; here with small constants, and every sphere on every pixel."""
+    by_default = peaks(100, 24)
+    constants = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "GROUP_TILES": 1}
+    for name, value in constants.items():
+        monkeypatch.setattr(walk, name, value)
+    for n, side in ((100, 24), (400, 24), (100, 48)):  # of which each but the first has four times the pairs
+        allowed = 30 * n + 32 * side * side + 10 * constants["BLOCK"] + 150 * constants["GROUP"]
+        assert peaks(n, side) < allowed
+        assert by_default > 4 * allowed                                               # the measure does see the working memory
 
 
 def test_threads_change_no_bit() -> None:

@@ -54,7 +54,7 @@ def read_header(path: Path) -> Header:
             case [] | ["obj_info" | "ply", *_]:
                 pass
             case _:
-                raise ValueError(f"{path}: expected a .ply header line; got {line!r}")
+                raise ValueError(f"{path}: expected a .ply header line; got {line[:80]!r}")
     if "vertex" not in header.elements:
         raise ValueError(f"{path}: expected an element `vertex`; got {', '.join(header.elements) or 'no element'}")
     return header

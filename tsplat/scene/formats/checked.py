@@ -13,11 +13,13 @@ from numpy.typing import DTypeLike, NDArray
 
 T = TypeVar("T")
 REQUIRED: Any = object()
+MAX_REASON = 400                # characters: it may quote the file
 
 
 def malformed(path: str | os.PathLike[str], offset: int, reason: str) -> ValueError:
     """The error for a file that is not what it should be: one line with the file, where in it, and why."""
-    return ValueError(f"{os.fspath(path)}: at byte {offset}: {reason}")
+    reason = reason.partition("\n")[0]
+    return ValueError(f"{os.fspath(path)}: at byte {offset}: {reason if len(reason) <= MAX_REASON else reason[:MAX_REASON] + '...'}")
 
 
 class Reader:

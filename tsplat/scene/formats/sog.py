@@ -153,7 +153,8 @@ def _harmonics(files: _Files, meta: Json, count: int) -> Floats:
     entries = min(len(palette), harmonics.get("count", int, len(palette)))
     if labels.max(initial=0) >= entries:
         raise harmonics.wrong(f"expected labels below {entries}, the entries of the palette; got {labels.max()}")
-    return _codebook(meta, "shN")[palette][labels]
+    coefficients: Floats = _codebook(meta, "shN")[palette][labels]
+    return coefficients
 
 
 def _codebook(meta: Json, key: str) -> Floats:

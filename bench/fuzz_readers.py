@@ -11,6 +11,7 @@ may grow by 64 MiB (files have a few kB) and in which a file may take 5 seconds.
 from __future__ import annotations
 
 import argparse
+import copy
 import io
 import json
 import random
@@ -245,8 +246,8 @@ def _change_json(document: object, rng: random.Random) -> None:
             case 0:
                 container[key] = rng.choice(VALUES)
             case 1:
-                container[key] = rng.choice(rng.choice(places)[:1])
-                container[key] = json.loads(json.dumps(container[key], default=str)) if container[key] is not container else {}
+                other, place = rng.choice(places)
+                container[key] = copy.deepcopy(other[place])
             case 2:
                 del container[key]
 

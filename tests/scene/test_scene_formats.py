@@ -1,5 +1,6 @@
 """File formats of Gaussians: round trips within the steps of their codes, real files against their .ply twins, what is left out."""
 
+import itertools
 import json
 import math
 import struct
@@ -144,7 +145,7 @@ def test_what_cannot_be_written_is_left_out(tmp_path: Path, name: str) -> None:
     gaussians.opacity_logits.data[2] = math.inf
     gaussians.quats.data[3] *= 1e25                                 # whose square is beyond float32
     highest = {"a.spz": 4, "a.splat": 0}.get(name, 3)
-    with pytest.warns(UserWarning) as warned:
+    with pytest.warns(UserWarning, match="left out") as warned:
         gaussians.save(tmp_path / name)
     texts = [str(warning.message) for warning in warned]
     assert texts[0] == f"{tmp_path / name}: 2 of 5 splats with NaN, infinity or no rotation are left out"
@@ -206,7 +207,7 @@ def test_turning(degree: int) -> None:
 def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     make(300, 1).save(tmp_path / "a.ply")
     names = ["a.ply", "new folder/ä.compressed.ply", "b.spz", "c.glb", "d.splat"]
-    for source, target in zip(names[:-1], names[1:], strict=True):
+    for source, target in itertools.pairwise(names):
         assert main(["convert", str(tmp_path / source), str(tmp_path / target)]) == 0
         printed = capsys.readouterr()
         assert printed.out == f"300 splats: {tmp_path / target} ({(tmp_path / target).stat().st_size} bytes)\n"
@@ -229,7 +230,7 @@ def payload(path: Path) -> list[np.ndarray]:
     sizes = [9, 1, 3, 3, 4, 3 * ((degree + 1) ** 2 - 1)]
     ends = 16 + n * np.cumsum([0, *sizes])
     assert ends[-1] == len(data)
-    return [np.frombuffer(data[a:b], np.uint8).reshape(n, -1).astype(int) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    return [np.frombuffer(data[a:b], np.uint8).reshape(n, -1).astype(int) for a, b in itertools.pairwise(ends)]
 
 
 @pytest.fixture(scope="module")

@@ -230,7 +230,7 @@ def _read_accessor(document: Json, binary: Reader, accessor: Json, kind: str) ->
     if view.get("extensions", dict, {}):
         raise view.wrong(f"compressed buffers are not supported; found {', '.join(view.value['extensions'])}")
     buffer = document.at("buffers").at(view.get("buffer", int))
-    if buffer.value != document.get("buffers", list)[0] or "uri" in buffer._checked(dict).value:
+    if view.value["buffer"] != 0 or buffer.get("uri", object, None) is not None:
         raise view.wrong("expected a view of buffer 0, which is in the .glb file")
     start, size = view.get("byteOffset", int, 0), view.get("byteLength", int)
     row = dtype.itemsize * width

@@ -28,6 +28,8 @@ from tsplat.kernels.tiles import (
     load_record,
     of_batch,
     prefetch_records,
+    row_dot,
+    row_moments,
     store_channels,
     tile_list,
     tile_sums,
@@ -73,7 +75,6 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
     """Image `[C, H, W, D]` and alpha `[C, H, W]` of a block of tiles."""
     view, tile, exists, left, top, x, y, column4, pixel4 = block_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
     cx = left.to(x.dtype) + TILE / 2
-    cy = top.to(x.dtype) + TILE / 2
     T = glue(tl.where(column4 < W, 1.0, 0.0), tl.where(column4 + 1 < W, 1.0, 0.0)) + x * 0.0     # beyond the border finished
     C0 = x * 0.0
     C1 = x * 0.0
@@ -90,7 +91,7 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
         while u < TILE:                                                 # a loop: unrolled, it takes more registers and is no faster
             splat = of_batch(batch, u, ids, start, i, hits, null, PTX)
             r = load_record(records, splat, D)
-            w = T * splat_alpha(r[0] - cx, r[1] - cy, r[2], r[3], r[4], r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
+            w = T * splat_alpha(r[0] - cx, r[1], r[2], r[3], r[4], r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
             if DROP_LAST:
                 w, T = without_last(w, T)
             C0 += r[6] * w
@@ -142,7 +143,6 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
     """
     view, tile, exists, left, top, x, y, column4, pixel4 = block_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
     cx = left.to(x.dtype) + TILE / 2
-    cy = top.to(x.dtype) + TILE / 2
     v0 = load_pixels(v_image, pixel4, column4, W, D, 0)
     v1 = load_pixels(v_image, pixel4, column4, W, D, 1)
     v2 = load_pixels(v_image, pixel4, column4, W, D, 2)
@@ -174,10 +174,9 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
         u = 0
         while u < stop:
             splat = of_batch(batch, u, ids, start, i, hits, null, PTX)
-            real = i + u < hits
             r = load_record(records, splat, D)
             mx = r[0] - cx
-            my = r[1] - cy
+            my = r[1]
             l00, l10, l11 = r[2:5]
             alpha = splat_alpha(mx, my, l00, l10, l11, r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
             w = alpha * T
@@ -198,11 +197,12 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
                 reciprocal = 1.0 / T
             v = w * (g - rest * reciprocal)
             v = tl.where(alpha < tl.full((), ALPHA_MAX, x.dtype), v, 0.0)
-            s0, sx, sy, sxx, sxy, syy = lane_moments(v, mx, my, x, y)
-            w0 = tl.sum(w * v0, 1, keep_dims=True)
-            w1 = tl.sum(w * v1, 1, keep_dims=True) if D > 1 else none
-            w2 = tl.sum(w * v2, 1, keep_dims=True) if D > 2 else none
-            w3 = tl.sum(w * v3, 1, keep_dims=True) if D > 3 else none
+            row_s0, row_x, row_xx = row_moments(v)
+            s0, sx, sy, sxx, sxy, syy = lane_moments(row_s0, row_x, row_xx, mx, my, y)
+            w0 = row_dot(w, v0)
+            w1 = row_dot(w, v1) if D > 1 else none
+            w2 = row_dot(w, v2) if D > 2 else none
+            w3 = row_dot(w, v3) if D > 3 else none
             ax = none
             ay = none
             if ABSGRAD:
@@ -211,6 +211,7 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
                 ay = tl.sum(tl.abs(v * slope_y), 1, keep_dims=True)
             COUNT: tl.constexpr = 12 if ABSGRAD or D > 3 else 9
             first, slot, second, second_slot, has_second = tile_sums(s0, sx, sy, sxx, sxy, syy, w0, w1, w2, w3, ax, ay, COUNT, PTX)
+            real = splat != null
             if PER_HIT:
                 q = sums + (start + i + u) * SUMS
                 tl.store(q + slot, first, mask=real)

@@ -103,7 +103,7 @@ def render_spheres(positions: Tensor, features: Tensor, radii: Tensor, camera: C
         p, R = _scale_gradient(p.expand(C, -1, 3), keep[..., None]), _scale_gradient(R.expand(C, -1), keep)
     centers = _to_camera(p, viewmats)
     outline = ops.outlines(centers, R, Ks, width, height, model, near, far)
-    finite = (torch.linalg.vector_norm(f.detach(), torch.inf, -1) < torch.inf) & (o.detach() >= 0) & (o.detach() < torch.inf)
+    finite = (torch.linalg.vector_norm(f.detach(), 2, -1) < torch.inf) & (o.detach() >= 0) & (o.detach() < torch.inf)
     visible = outline.radii * finite[..., None]
     to_bin = outline.means2d, visible, outline.conics, outline.opacities, outline.depths, width, height, tile
     bins, needed = (ops.bin_splats(*to_bin), None) if capacity is None else ops.bin_splats_fixed(*to_bin, capacity)

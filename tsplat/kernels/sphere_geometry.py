@@ -11,6 +11,8 @@ that pad. The record behind the last is the null sphere, which is nowhere.
 
 from __future__ import annotations
 
+import math
+
 import triton
 import triton.language as tl
 from torch import Tensor
@@ -20,6 +22,9 @@ from tsplat.kernels.launch import Launcher, ceil_div, launch
 
 CHANNELS = 4
 """Up to here a sphere's features are in its record and a pixel's in registers."""
+CHECK = 64
+"""Spheres after which a tile may end: as in the reference, so that the same count."""
+LOG2E = tl.constexpr(math.log2(math.e))
 NOWHERE = tl.constexpr(1e15)
 """x of the null sphere, of radius 1: no ray reaches that, and its square is a float32."""
 
@@ -76,6 +81,27 @@ def enter(mx, my, w, w2, x, y, z, R, r, distance, ORTHO: tl.constexpr, CHORD: tl
 def far_off(x, y, z):
     """Distance of a centre."""
     return tl.sqrt(x * x + y * y + z * z)
+
+
+@triton.jit
+def depth_slope(gamma, near, far, dt: tl.constexpr):
+    """near and far, and (p, q) with (1 - (D - near)/(far - near)) log2(e)/gamma = p - q D, and log2(e)/gamma."""
+    n = tl.full((), near, dt)
+    f = tl.full((), far, dt)
+    scale = tl.full((), LOG2E, dt) / tl.load(gamma)
+    return n, f, scale * (1.0 + n / (f - n)), scale / (f - n), scale
+
+
+@triton.jit
+def term(logit, hit, o):
+    """2^logit of an opacity o, where it hits, else 0; logit relative to the logarithm of the softmax's denominator.
+
+    o d 2^logit is at most 1, and d at least half the eps of 1, so that there is a limit. It acts at an outline where the forward rounded a
+    tiny d to a miss and has no such term in its sum: else that might be any number.
+    """
+    LIMIT: tl.constexpr = 54 if logit.dtype == tl.float64 else 25
+    limit = LIMIT - tl.log2(tl.maximum(o, tl.full((), 1e-30, logit.dtype)))
+    return tl.where(hit, tl.exp2(tl.minimum(logit, limit)), 0.0)
 
 
 @triton.jit
@@ -197,15 +223,13 @@ class Spheres:
             centers.contiguous(), radii.contiguous(), opacities.contiguous(), self.features, self.records, self.R,
             *(max(v.shape[0] * self.N, 1) for v in (radii, opacities, features)), D=self.D if self.few else 0, RECORD=self.record, **options)
 
-
-def gradients(s: Spheres, sums: Tensor, v_features: Tensor | None, radii: Tensor, opacities: Tensor, features: Tensor
-              ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Of centres, radii, opacities, features and gamma, from the sums `[R, SUMS]`; the features' (unless None) are those."""
-    per_camera = sums.new_empty(s.C, s.N, 3), sums.new_empty(s.C, s.N), sums.new_empty(s.C, s.N), sums.new_empty(s.C, s.N, s.D if s.few else 0)
-    if s.R:
-        options = launch("records")
-        unpack_spheres_kernel[(ceil_div(s.R, options["BLOCK"]),)](sums, *per_camera, s.R, D=s.D if s.few else 0, **options)
-    v_centers, v_radii, v_opacities, v_some = per_camera
-    v_radii, v_opacities, v_features = (v if len(v) == len(x) else v.sum(0, keepdim=True) for v, x in (
-        (v_radii, radii), (v_opacities, opacities), (v_some if v_features is None else v_features, features)))
-    return v_centers, v_radii, v_opacities, v_features, sums[:, 5].sum()
+    def gradients(self, sums: Tensor, radii: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Of centres, radii, opacities and up to 4 features, from the sums `[R, SUMS]`."""
+        C, N, D = self.C, self.N, self.D if self.few else 0
+        each = sums.new_empty(C, N, 3), sums.new_empty(C, N), sums.new_empty(C, N), sums.new_empty(C, N, D)
+        if self.R:
+            options = launch("records")
+            unpack_spheres_kernel[(ceil_div(self.R, options["BLOCK"]),)](sums, *each, self.R, D=D, **options)
+        v_centers, v_radii, v_opacities, v_features = (v if len(v) == len(x) else v.sum(0, keepdim=True) for v, x in zip(
+            each, (each[0], radii, opacities, self.features), strict=True))
+        return v_centers, v_radii, v_opacities, v_features

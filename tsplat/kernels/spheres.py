@@ -6,8 +6,6 @@ computes all terms again, from the logarithm of the softmax's denominator. More 
 
 from __future__ import annotations
 
-import math
-
 import torch
 import triton
 import triton.language as tl
@@ -16,7 +14,20 @@ from tsplat_reference.constants import EVERYWHERE, ON_OUTLINE
 
 from tsplat.kernels.footprint import SUMS, TILE
 from tsplat.kernels.launch import Launcher, ceil_div, current_target, launch
-from tsplat.kernels.sphere_geometry import Spheres, enter, far_off, gradients, rays, reciprocal, term_gradients
+from tsplat.kernels.sphere_features import sphere_feature_bwd_kernel, sphere_feature_fwd_kernel, sphere_features_bwd_kernel
+from tsplat.kernels.sphere_geometry import (
+    CHANNELS,
+    CHECK,
+    LOG2E,
+    Spheres,
+    depth_slope,
+    enter,
+    far_off,
+    rays,
+    reciprocal,
+    term,
+    term_gradients,
+)
 from tsplat.kernels.tiles import (
     block_pixels,
     blocks,
@@ -35,9 +46,6 @@ from tsplat.kernels.tiles import (
     tile_sums,
 )
 
-LOG2E = tl.constexpr(math.log2(math.e))
-CHECK = 64
-"""Spheres after which a tile may end: as in the reference, so that the same count."""
 ANYWHERE = tl.constexpr(EVERYWHERE)
 OUTLINE = tl.constexpr(ON_OUTLINE)
 
@@ -109,27 +117,6 @@ def load_sphere(records, sphere, RECORD: tl.constexpr):
         return first + second + second
     else:
         return load4(p) + load4(p + 4) + load4(p + 8)
-
-
-@triton.jit
-def depth_slope(gamma, near, far, dt: tl.constexpr):
-    """near and far, and (p, q) with (1 - (D - near)/(far - near)) log2(e)/gamma = p - q D, and log2(e)/gamma."""
-    n = tl.full((), near, dt)
-    f = tl.full((), far, dt)
-    scale = tl.full((), LOG2E, dt) / tl.load(gamma)
-    return n, f, scale * (1.0 + n / (f - n)), scale / (f - n), scale
-
-
-@triton.jit
-def term(logit, hit, o):
-    """2^logit of an opacity o, where it hits, else 0; logit relative to the logarithm of the softmax's denominator.
-
-    o d 2^logit is at most 1, and d at least half the eps of 1, so that there is a limit. It acts at an outline where the forward rounded a
-    tiny d to a miss and has no such term in its sum: else that might be any number.
-    """
-    LIMIT: tl.constexpr = 54 if logit.dtype == tl.float64 else 25
-    limit = LIMIT - tl.log2(tl.maximum(o, tl.full((), 1e-30, logit.dtype)))
-    return tl.where(hit, tl.exp2(tl.minimum(logit, limit)), 0.0)
 
 
 @Launcher
@@ -375,36 +362,66 @@ def blend_spheres_backward(centers: Tensor, radii: Tensor, opacities: Tensor, fe
     """Launcher; see `tsplat_reference.blend_sphere_blocks_backward`.
 
     Sums over pixels are atomic, so that their last bits differ from run to run, but not under `torch.use_deterministic_algorithms(True)`:
-    then each hit has a row of sums of its own (48 bytes), added up in order.
+    then each hit has a row of sums of its own (48 bytes), added up in order; more than 4 channels take a pass per 4.
     """
-    s = Spheres(centers, radii, opacities, features, Ks, ids, offsets, width, height, tile)
     image, depths, logsumexp, used = (v.contiguous() for v in images)
-    v_image = v_image.contiguous()
+    v_image, backgrounds = v_image.contiguous(), backgrounds.contiguous()
     v_depth, v_logsumexp, cutoff = (None if v is None else v.contiguous() for v in (v_depth, v_logsumexp, cutoff))
-    options = launch("upstream")
+    C, D, options = len(centers), features.shape[2], launch("upstream")
     common, programs = torch.empty_like(logsumexp), ceil_div(width * height, options["BLOCK"])
-    partials = centers.new_empty(s.C, programs, s.D + 1)
-    upstream_kernel[(programs, s.C)](image, depths, logsumexp, backgrounds.contiguous(), gamma, v_image, v_depth, v_logsumexp, common, partials,
-                                     width * height, s.D, background_depth, **options)
+    partials = centers.new_empty(C, programs, D + 1)
+    upstream_kernel[(programs, C)](image, depths, logsumexp, backgrounds, gamma, v_image, v_depth, v_logsumexp, common, partials,
+                                   width * height, D, background_depth, **options)
     behind = partials.sum(1)
 
+    def terms(some: slice, common: Tensor, v_depth: Tensor | None) -> list[Tensor]:
+        s = Spheres(centers, radii, opacities, features[..., some], Ks, ids, offsets, width, height, tile)
+        return _terms_backward(s, radii, opacities, gamma, cutoff, logsumexp, used, v_image[..., some].contiguous(), common, v_depth, width,
+                               height, model, near, far, chord, intrinsics)
+
+    if D <= CHANNELS or not torch.are_deterministic_algorithms_enabled():
+        v_features, *rest = terms(slice(None), common, v_depth)
+    else:                                               # linear in what is upstream, of which all but the image goes with the first pass
+        parts = [terms(slice(0, CHANNELS), common, v_depth)]
+        parts += [terms(slice(c, c + CHANNELS), torch.zeros_like(common), None) for c in range(CHANNELS, D, CHANNELS)]
+        v_features, *rest = torch.cat([p[0] for p in parts], -1), *(torch.stack(v).sum(0) for v in list(zip(*parts, strict=True))[1:])
+    v_centers, v_radii, v_opacities, v_gamma, v_Ks = rest
+    return v_centers, v_radii, v_opacities, v_features, behind[:, :D].contiguous(), v_gamma + behind[:, D].sum(), v_Ks
+
+
+def _terms_backward(s: Spheres, radii: Tensor, opacities: Tensor, gamma: Tensor, cutoff: Tensor | None, logsumexp: Tensor, used: Tensor,
+                    v_image: Tensor, common: Tensor, v_depth: Tensor | None, width: int, height: int, model: str, near: float, far: float,
+                    chord: bool, intrinsics: bool) -> list[Tensor]:
+    """Gradients of features, centers, radii, opacities, gamma and Ks by way of the spheres' terms."""
     deterministic = torch.are_deterministic_algorithms_enabled()
-    flags = {"ORTHO": model == "orthographic", "CHORD": chord and model == "pinhole", "EPS": torch.finfo(centers.dtype).eps}
     target = current_target()
-    ptx = target.ptx and centers.dtype == torch.float32
-    sums = centers.new_zeros(len(ids) if deterministic else s.R + 1, SUMS.value)
+    ptx = target.ptx and gamma.dtype == torch.float32
+    sums = gamma.new_zeros(len(s.ids) if deterministic else s.R + 1, SUMS.value)
+    flags = {"ORTHO": model == "orthographic", "CHORD": chord and model == "pinhole", "PTX": ptx}
+    size, eps = (width, height, *s.grid, s.R), torch.finfo(gamma.dtype).eps
     v_features = None
-    count = blocks(s.grid, target.lanes)
-    v_rays = centers.new_empty(s.C, count * target.lanes, 4) if intrinsics else None
-    sphere_bwd_kernel[(s.C * count,)](
-        s.records, s.ids, s.offsets, used, gamma, s.Ks, cutoff, logsumexp, common, v_image, v_depth, sums, v_rays,
-        lane_x(target.lanes, centers), width, height, *s.grid, s.R, near, far, D=s.D, **flags, PER_HIT=deterministic, RECORD=s.record,
-        LANES=target.lanes, PTX=ptx, **launch("blend_spheres_backward"))
-    if deterministic:
-        sums = centers.new_zeros(s.R + 1, SUMS.value).index_add_(0, s.ids.long(), sums)
-    v_centers, v_radii, v_opacities, v_features, v_gamma = gradients(s, sums[:s.R], v_features, radii, opacities, features)
-    return (v_centers, v_radii, v_opacities, v_features, behind[:, :-1].contiguous(), v_gamma + behind[:, -1].sum(),
-            _intrinsics_gradient(s.Ks, v_rays))
+    if s.few:
+        count = blocks(s.grid, target.lanes)
+        v_rays = gamma.new_empty(s.C, count * target.lanes, 4) if intrinsics else None
+        sphere_bwd_kernel[(s.C * count,)](
+            s.records, s.ids, s.offsets, used, gamma, s.Ks, cutoff, logsumexp, common, v_image, v_depth, sums, v_rays,
+            lane_x(target.lanes, gamma), *size, near, far, D=s.D, EPS=eps, PER_HIT=deterministic, RECORD=s.record, LANES=target.lanes, **flags,
+            **launch("blend_spheres_backward"))
+        if deterministic:
+            sums = gamma.new_zeros(s.R + 1, SUMS.value).index_add_(0, s.ids.long(), sums)
+    else:
+        v_features, rows = torch.zeros_like(s.features), max(len(s.features) * s.N, 1)
+        v_rays = gamma.new_empty(s.C, s.tiles // s.C, 4) if intrinsics else None
+        flags |= {"P": TILE.value**2, "PRECISION": "tf32x3" if ptx else "ieee"}
+        options = launch("sphere_features_backward")
+        sphere_features_bwd_kernel[(s.tiles, ceil_div(s.D, options["DB"]))](
+            s.records, s.ids, s.offsets, used, gamma, s.Ks, cutoff, logsumexp, v_image, v_features, *size, rows, s.D, near, far, **flags,
+            **options)
+        sphere_feature_bwd_kernel[(s.tiles,)](
+            s.records, s.features, s.ids, s.offsets, used, gamma, s.Ks, cutoff, logsumexp, common, v_image, v_depth, sums, v_rays, *size, rows,
+            s.D, near, far, EPS=eps, **flags, **launch("sphere_feature_backward"))
+    *gradients, v_some = s.gradients(sums[:s.R], radii, opacities)
+    return [v_some if v_features is None else v_features, *gradients, sums[:s.R, 5].sum(), _intrinsics_gradient(s.Ks, v_rays)]
 
 
 def _intrinsics_gradient(Ks: Tensor, v_rays: Tensor | None) -> Tensor:
@@ -425,11 +442,18 @@ def blend_spheres(centers: Tensor, radii: Tensor, opacities: Tensor, features: T
     s = Spheres(centers, radii, opacities, features, Ks, ids, offsets, width, height, tile)
     image, logsumexp = centers.new_empty(s.C, height, width, s.D), centers.new_empty(s.C, height, width)
     depths, used = centers.new_empty(s.C, height if depth else 0, width), ids.new_empty(s.tiles, dtype=torch.int32)
-    scalars = near, far, background_depth, tolerance
-    flags = {"ORTHO": model == "orthographic", "CHORD": chord and model == "pinhole", "DEPTH": depth, "CHECK": CHECK if tolerance > 0 else 1 << 30}
     target = current_target()
     ptx = target.ptx and centers.dtype == torch.float32
-    sphere_fwd_kernel[(s.C * blocks(s.grid, target.lanes),)](
-        s.records, s.ids, s.offsets, backgrounds.contiguous(), gamma, s.Ks, image, depths, logsumexp, used, lane_x(target.lanes, centers),
-        width, height, *s.grid, s.R, *scalars, D=s.D, **flags, RECORD=s.record, LANES=target.lanes, PTX=ptx, **launch("blend_spheres"))
-    return image, depths, logsumexp, used
+    flags = {"ORTHO": model == "orthographic", "CHORD": chord and model == "pinhole", "DEPTH": depth,
+             "CHECK": CHECK if tolerance > 0 else 1 << 30, "PTX": ptx}
+    out, scalars = (image, depths, logsumexp, used), (near, far, background_depth, tolerance)
+    if s.few:
+        sphere_fwd_kernel[(s.C * blocks(s.grid, target.lanes),)](
+            s.records, s.ids, s.offsets, backgrounds.contiguous(), gamma, s.Ks, *out, lane_x(target.lanes, centers), width, height, *s.grid,
+            s.R, *scalars, D=s.D, RECORD=s.record, LANES=target.lanes, **flags, **launch("blend_spheres"))
+    else:
+        options = launch("sphere_features")
+        sphere_feature_fwd_kernel[(s.tiles, ceil_div(s.D, options["DB"]))](
+            s.records, s.features, s.ids, s.offsets, backgrounds.contiguous(), gamma, s.Ks, *out, width, height, *s.grid, s.R,
+            max(len(features) * s.N, 1), s.D, *scalars, P=tile * tile, PRECISION="tf32x3" if ptx else "ieee", **flags, **options)
+    return out

@@ -91,7 +91,7 @@ def sphere_features_bwd_kernel(records, ids, offsets, used, gamma, Ks, cutoff, l
     tile = tl.program_id(0)
     view, x, y, cx, cy, first, pixel, inside = tile_pixels(tile, tiles_x, tiles_y, W, H, dt, P)
     mx, my, w, w2 = rays(Ks, view, x + cx, y + cy, ORTHO)
-    n, f, level, slope, _ = depth_slope(gamma, near, far, dt)
+    n, f, level, slope, scale = depth_slope(gamma, near, far, dt)
     d = tl.program_id(1) * DB + tl.arange(0, DB)
     real_d = (d < D)[:, None]
     V = tl.load(v_image + first * D + (pixel[None, :] * D + d[:, None]), mask=inside[None, :] & real_d, other=0.0)             # [DB, P]
@@ -124,7 +124,7 @@ def sphere_feature_bwd_kernel(records, features, ids, offsets, used, gamma, Ks, 
     tile = tl.program_id(0)
     view, x, y, cx, cy, first, pixel, inside = tile_pixels(tile, tiles_x, tiles_y, W, H, dt, P)
     mx, my, w, w2 = rays(Ks, view, x + cx, y + cy, ORTHO)
-    n, f, level, slope, _ = depth_slope(gamma, near, far, dt)
+    n, f, level, slope, scale = depth_slope(gamma, near, far, dt)
     inv_gamma = 1.0 / tl.load(gamma)
     depth1 = 1.0 / (f - n)
     depth0 = 1.0 + n * depth1

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from tsplat.kernels.footprint import SUMS, TILE, store4
 from tsplat.kernels.launch import Launcher, ceil_div, launch
+from tsplat.kernels.tiles import load4
 
 CHANNELS = 4
 """Up to here a sphere's features are in its record and a pixel's in registers."""
@@ -81,6 +82,18 @@ def enter(mx, my, w, w2, x, y, z, R, r, distance, ORTHO: tl.constexpr, CHORD: tl
 def far_off(x, y, z):
     """Distance of a centre."""
     return tl.sqrt(x * x + y * y + z * z)
+
+
+@triton.jit
+def load_sphere(records, sphere, RECORD: tl.constexpr):
+    """Each lane's sphere: x, y, z, R, opacity, 3 features, and four more or copies of these."""
+    p = records + sphere.to(tl.int64) * RECORD
+    if RECORD == 8:
+        first = load4(p)
+        second = load4(p + 4)
+        return first + second + second
+    else:
+        return load4(p) + load4(p + 4) + load4(p + 8)
 
 
 @triton.jit

@@ -23,11 +23,13 @@ from tsplat.kernels.sphere_geometry import (
     depth_slope,
     enter,
     far_off,
+    load_sphere,
     rays,
     reciprocal,
     term,
     term_gradients,
 )
+from tsplat.kernels.sphere_tracking import nearest_hits as nearest_hits
 from tsplat.kernels.tiles import (
     block_pixels,
     blocks,
@@ -35,7 +37,6 @@ from tsplat.kernels.tiles import (
     half_pixels,
     halves,
     lane_x,
-    load4,
     load_batch,
     load_pixels,
     of_batch,
@@ -105,18 +106,6 @@ def outlines_kernel(centers, radii, Ks, radii2d, means2d, conics, opacities, dep
     tl.store(conics + 3 * i + 2, c, mask=real)
     tl.store(opacities + i, tl.full((BLOCK,), OUTLINE, dt), mask=real)
     tl.store(depths + i, depth, mask=real)
-
-
-@triton.jit
-def load_sphere(records, sphere, RECORD: tl.constexpr):
-    """Each lane's sphere: x, y, z, R, opacity, 3 features, and four more or copies of these."""
-    p = records + sphere.to(tl.int64) * RECORD
-    if RECORD == 8:
-        first = load4(p)
-        second = load4(p + 4)
-        return first + second + second
-    else:
-        return load4(p) + load4(p + 4) + load4(p + 8)
 
 
 @Launcher

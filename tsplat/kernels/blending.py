@@ -7,8 +7,6 @@ channels go through matrix products, in `feature_blending.py`.
 
 from __future__ import annotations
 
-import functools
-
 import torch
 import triton
 import triton.language as tl
@@ -20,9 +18,11 @@ from tsplat.kernels.footprint import LOG2_MIN, SUMS, T_MIN, TILE
 from tsplat.kernels.launch import Launcher, ceil_div, current_target, launch
 from tsplat.kernels.tiles import (
     block_pixels,
+    blocks,
     glue,
     half_pixels,
     halves,
+    lane_x,
     load_batch,
     load_pixels,
     load_record,
@@ -114,7 +114,7 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
     following = load_batch(ids, start, TILE, hits, null)
     while i < longest:
         later = load_batch(ids, start, i + 2 * TILE, hits, null)        # two batches ahead, so that nothing waits for it
-        prefetch_records(records, following, PTX)
+        prefetch_records(records, following, 12, PTX)
         u = 0
         while u < TILE:                                                 # a loop: unrolled, it takes more registers and is no faster
             splat = of_batch(batch, u, ids, start, i, hits, null, PTX)
@@ -203,7 +203,7 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
     following = load_batch(ids, start, TILE, hits, null)
     while i < longest:
         later = load_batch(ids, start, i + 2 * TILE, hits, null)
-        prefetch_records(records, following, PTX)
+        prefetch_records(records, following, 12, PTX)
         stop = tl.minimum(TILE, longest - i)
         u = 0
         while u < stop:
@@ -261,13 +261,6 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
         longest = tl.where(tl.max(tl.max(T, 1), 0) > T_MIN, longest, 0)
 
 
-@functools.cache
-def _lane_x(lanes: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`[lanes, 4]`: x about the tile's centre of every second pixel of each lane's row."""
-    tile = int(TILE.value)
-    return (torch.arange(0, tile, 2, device=device).to(dtype) - (tile / 2 - 0.5)).repeat(lanes, 1)
-
-
 class _Scene:
     """Arguments of the kernels, contiguous, with records packed and launch constants chosen."""
 
@@ -290,11 +283,8 @@ class _Scene:
         target = current_target()
         self.common = {"ALPHA_MAX": alpha_max, "DROP_LAST": drop_last, "log2_alpha": footprint.log2_alpha, "enable_fp_fusion": True}
         lanes, ptx = target.lanes, target.ptx and means2d.dtype == torch.float32
-        # what is made while a CUDA graph is captured has no numbers until its replay: not to be kept
-        capturing = means2d.is_cuda and torch.cuda.is_current_stream_capturing()
         self.predicates = target.predicates
-        self.lane_x = (_lane_x.__wrapped__ if capturing else _lane_x)(lanes, means2d.dtype, means2d.device)
-        self.blocks = self.C * ceil_div(self.grid[0], 2) * ceil_div(self.grid[1], lanes // (2 * tile))
+        self.lane_x, self.blocks = lane_x(lanes, means2d), self.C * blocks(self.grid, lanes)
         self.warp = {**self.common, "D": self.D, "LANES": lanes, "PTX": ptx}
         self.block = {**self.common, "P": tile * tile, "PRECISION": "tf32x3" if ptx else "ieee"}
 

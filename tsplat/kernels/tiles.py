@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+
+import torch
 import triton
 import triton.language as tl
+from torch import Tensor
 
 from tsplat.kernels.footprint import TILE
+from tsplat.kernels.launch import ceil_div
 
 
 @triton.jit
@@ -152,12 +157,12 @@ def of_batch(batch, u, ids, start, i, hits, null, PTX: tl.constexpr):
 
 
 @triton.jit
-def prefetch_records(records, batch, PTX: tl.constexpr):
-    """Have the records of the next batch fetched into L1 while this one is blended, each lane one: 2 sectors of 32 bytes. Half of the cycles
-    of a warp were waiting for them."""
+def prefetch_records(records, batch, RECORD: tl.constexpr, PTX: tl.constexpr):
+    """Have the records, of 8 or 12 numbers, of the next batch fetched into L1 while this one is blended, each lane one: 1 or 2 sectors of 32
+    bytes. Half of the cycles of a warp were waiting for them."""
     if PTX:
-        p = (records + batch.to(tl.int64) * 12).to(tl.int64)
-        for word in tl.static_range(2):
+        p = (records + batch.to(tl.int64) * RECORD).to(tl.int64)
+        for word in tl.static_range((RECORD + 7) // 8):
             tl.inline_asm_elementwise("prefetch.global.L1 [$1]; mov.b32 $0, 0;", "=r,l", [p + 44 * word], dtype=tl.int32, is_pure=False, pack=1)
 
 
@@ -229,3 +234,29 @@ def tile_sums(s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, COUNT: tl.conste
             second = tl.where(row == 2, tile_sum(s10), second)
             second = tl.where(row == 3, tile_sum(s11), second)
         return first, row, second, row + 8, row < COUNT - 8
+
+
+@triton.jit
+def tile_min(v):
+    """Least of the lanes of each tile, in every lane of it (portable)."""
+    groups: tl.constexpr = v.shape[0] // TILE
+    least = tl.min(tl.reshape(v, (groups, TILE)), 1, keep_dims=True)
+    return tl.reshape(tl.broadcast_to(least, (groups, TILE)), (v.shape[0], 1))
+
+
+def blocks(tiles: tuple[int, int], lanes: int) -> int:
+    """How many programs `block_pixels` makes of the tiles (columns, rows) of a camera."""
+    return ceil_div(tiles[0], 2) * ceil_div(tiles[1], lanes // (2 * int(TILE.value)))
+
+
+def lane_x(lanes: int, like: Tensor) -> Tensor:
+    """`[lanes, 4]`: x about the tile's centre of every second pixel of each lane's row."""
+    # what is made while a CUDA graph is captured has no numbers until its replay: not to be kept
+    capturing = like.is_cuda and torch.cuda.is_current_stream_capturing()
+    return (_lane_x.__wrapped__ if capturing else _lane_x)(lanes, like.dtype, like.device)
+
+
+@functools.cache
+def _lane_x(lanes: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    tile = int(TILE.value)
+    return (torch.arange(0, tile, 2, device=device).to(dtype) - (tile / 2 - 0.5)).repeat(lanes, 1)

@@ -8,6 +8,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -66,6 +67,36 @@ class Spheres(nn.Module):
         """Each split into 12 that inherit its features and opacity."""
         positions, radii, parents = refine(self.positions, self.radii, reach)
         return Spheres(positions, radii, self.features[parents], self.opacities[parents])
+
+    @torch.no_grad()
+    def relocated(self, alive: Tensor, generator: torch.Generator) -> Spheres:
+        """As many spheres, but those that are not alive are copies of random ones that are, moved by about 0.7 of their radius per axis."""
+        live = alive.nonzero().squeeze(1)
+        if not len(live):
+            raise ValueError("alive: expected a sphere that is; got none (too high learning rates?)")
+        copied = live[torch.randint(len(live), (len(self) - len(live),), generator=generator)]
+        spheres = self.select(torch.cat([live, copied]))
+        spheres.positions[len(live):] += 0.7 * spheres.radii[len(live):, None] * torch.randn(len(copied), 3, generator=generator)
+        return spheres
+
+    @torch.no_grad()
+    def with_features(self, features: Tensor) -> Spheres:
+        """The same with other features."""
+        spheres = Spheres(self.positions, self.radii, features, self.opacities)
+        for name, parameter in spheres.named_parameters():
+            parameter.requires_grad_(self.get_parameter(name).requires_grad)
+        return spheres
+
+    def save(self, path: Path) -> None:
+        """To a file of torch's, in a folder that is made if need be."""
+        path.parent.mkdir(parents=True, exist_ok=True)
+        torch.save(self.state_dict(), path)
+
+    @staticmethod
+    def load(path: Path) -> Spheres:
+        """From a file that `save` wrote."""
+        state = torch.load(path, weights_only=True)
+        return Spheres(state["positions"], state["log_radii"].exp(), state["features"], state["opacity_logits"].sigmoid())
 
     def groups(self, size: float, speed: float = 1.0) -> list[dict[str, object]]:
         """Adam's parameter groups: positions move in proportion to the scene's size."""
@@ -153,6 +184,20 @@ def optimise(groups: list[dict[str, object]], views: Views, loss: Callable[[View
             decay.step()
             if step % 10 == 0:
                 bar.set_postfix(loss=f"{value.item():.4f}")
+
+
+def optimise_and_relocate(spheres: Spheres, views: Views, loss: Callable[[Spheres, Views, float], Tensor],
+                          alive: Callable[[Spheres], Tensor], *, rounds: int, steps: int, size: float, speed: float, batch: int,
+                          gamma: tuple[float, float], generator: torch.Generator, name: str) -> Spheres:
+    """`optimise` in rounds, of `steps` in all; between these, spheres that are not alive go where others are."""
+    fall = (gamma[1] / gamma[0]) ** (1 / rounds)
+    for i in range(rounds):
+        if i:
+            spheres = spheres.relocated(alive(spheres), generator)
+        ends = gamma[0] * fall**i, gamma[0] * fall ** (i + 1)
+        optimise(spheres.groups(size, speed), views, partial(loss, spheres), steps=max(1, steps // rounds), batch=batch, gamma=ends,
+                 generator=generator, name=f"{name} {i + 1}/{rounds}")
+    return spheres
 
 
 def psnr(image: Tensor, target: Tensor) -> float:

@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 
 import torch
-from common import Stage, Views, arguments, load_views, report, write_rows
+from common import ROOT, Stage, Views, arguments, load_views, report, write_rows
 from reconstruction import FINE_GAMMA, Result, reconstruct
 
 CENTRE = 0.04, -1.05, 0.0
@@ -21,9 +21,9 @@ DISTANCE = 3.0
 BACKGROUND = 0.1, 0.3, 0.9
 
 
-def stage_of_head() -> Stage:
-    """The ball that the head is in."""
-    return Stage(torch.tensor(CENTRE), RADIUS, DISTANCE, torch.tensor(BACKGROUND), fade_below=0.5)
+def stage_of_head(channels: int = 3) -> Stage:
+    """The ball that the head is in. Channels beyond the colours have no background."""
+    return Stage(torch.tensor(CENTRE), RADIUS, DISTANCE, torch.tensor(BACKGROUND + (0.0,) * (channels - 3)), fade_below=0.5)
 
 
 def load(data: Path, downscale: float) -> tuple[Views, Views]:
@@ -34,11 +34,13 @@ def load(data: Path, downscale: float) -> tuple[Views, Views]:
 def main(argv: list[str] | None = None) -> Result:
     """Reconstruct, print and draw."""
     parser = arguments(__doc__, "head.png", steps=300, batch=2, volume=8000, refinements=2, downscale=2.0, reach=1.0)
+    parser.add_argument("--spheres", type=Path, default=ROOT / "out" / "head.pt", help="a file for the spheres (default: out/head.pt)")
     args = parser.parse_args(argv)
     start, generator = time.process_time(), torch.Generator().manual_seed(args.seed)
     stage, (train, test) = stage_of_head(), load(args.data, args.downscale)
     result = reconstruct(stage, train, test, volume=args.volume, refinements=args.refinements, steps=args.steps, batch=args.batch,
                          reach=args.reach, generator=generator, say=lambda line: print(f"head, {line}", flush=True))
+    result.spheres.save(args.spheres)
     some = test[torch.tensor([0, 3, 6, 9])]
     with torch.no_grad():
         images = [stage.render(result.spheres, camera, FINE_GAMMA[1]) for camera, _ in some.each()]

@@ -14,8 +14,8 @@ from tsplat.fit.spheres import visibility, worth_keeping
 GAMMA = 0.1, 3e-3
 """Of the volume. Finer stages start where it ends, but for a little softness with which the new spheres sort themselves."""
 FINE_GAMMA = 1e-2, 1e-3
-FAINT = 0.02                # spheres of less opacity are dropped
 COLOR_DISTANCE = 0.15
+LEAST_WEIGHT = 0.5          # pixels of all views together
 
 
 @dataclass
@@ -35,11 +35,12 @@ def random_volume(count: int, stage: Stage, generator: torch.Generator, overlap:
 
 
 def prune(spheres: Spheres, stage: Stage, views: Views, gamma: float) -> Spheres:
-    """Without those that no view sees, that are of the background's colour, or that are as good as transparent."""
+    """Without those that no view sees and those of the background's colour. (Opacities tell little: with a small gamma, even o = 0.02 hides
+    the background.)"""
     weights = visibility(spheres.positions, spheres.radii, spheres.opacities, (camera for camera, _ in views.each()), gamma=gamma,
                          **stage.planes)
-    keep = worth_keeping(spheres.features.detach(), stage.background, weights, color_distance=COLOR_DISTANCE, least_weight=0.1)
-    return spheres.select(keep & (spheres.opacities > FAINT))
+    return spheres.select(worth_keeping(spheres.features.detach(), stage.background, weights, color_distance=COLOR_DISTANCE,
+                                        least_weight=LEAST_WEIGHT))
 
 
 def reconstruct(stage: Stage, train: Views, test: Views, *, volume: int, refinements: int, steps: int, batch: int, reach: float,

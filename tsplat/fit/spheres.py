@@ -33,7 +33,7 @@ def gamma_at(step: int, steps: int, first: float = 0.1, last: float = 1e-2) -> f
         check_number(name, gamma, "a gamma in [1e-5, 1]")
         if not GAMMA[0] <= gamma <= GAMMA[1]:
             raise ValueError(f"{name}: expected a gamma in [1e-5, 1]; got {gamma}")
-    return min(max(first * (last / first) ** (step / max(1, steps - 1)), GAMMA[0]), GAMMA[1])
+    return min(max(float(first * (last / first) ** (step / max(1, steps - 1))), GAMMA[0]), GAMMA[1])
 
 
 def visibility(positions: Tensor, radii: Tensor, opacities: Tensor, cameras: Iterable[Camera], *, gamma: float, near: float,

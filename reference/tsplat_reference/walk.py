@@ -16,7 +16,7 @@ R = TypeVar("R")
 CHUNK = 64
 """Splats of a tile per chunk. Finished pixels end with it, so more would waste work; fewer would pay the calls more often."""
 BLOCK = 1 << 18
-"""Pairs in a block: its buffers of this size, 5 MB in float32 where there are five, are the working set of a thread. Smaller ones fit closer
+"""Pairs in a block: its buffers of this size, 4 MB in float32 where there are four, are the working set of a thread. Smaller ones fit closer
 caches, but then the calls cost more than that gains (measured from 2^15 to 2^19)."""
 GROUP = 1 << 15
 """Hits of a group of blocks, whose small operations (gathering, coefficients, scattering) are done together, by one thread: about 60

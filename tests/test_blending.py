@@ -363,7 +363,7 @@ def test_working_memory_does_not_grow_with_the_pairs_of_pixels_and_splats(monkey
     Measured 14 numbers for each splat and each pixel in the forward, 27 and 13 in the backward.
     """
     by_default = peaks(100, 24)
-    constants = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "GROUP_TILES": 1}
+    constants = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "FEW": 1 << 6, "GROUP_TILES": 1}
     for name, value in constants.items():
         monkeypatch.setattr(walk, name, value)
     for n, side in ((100, 24), (400, 24), (100, 48)):  # of which each but the first has four times the pairs

@@ -12,11 +12,8 @@ import scenes
 import torch
 import tsplat_reference as reference
 from backends import Backend
-from compare import assert_close, assert_same_bits, gradients, leaves, strided, threads
+from compare import Peak, assert_close, assert_same_bits, gradients, leaves, strided, threads
 from torch import Tensor
-from torch.multiprocessing.reductions import StorageWeakRef
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
 from tsplat_reference import blending, blocks, footprint
 
 from tsplat import ops
@@ -143,12 +140,12 @@ def test_chunks_blocks_and_groups_change_nothing(monkeypatch: pytest.MonkeyPatch
         return [*outputs, *gradients(outputs, [*inputs, probe])]
 
     want = run()
-    for name, value in (("CHUNK", chunk), ("BLOCK", block), ("GROUP", group), ("GROUP_TILES", group_tiles)):
+    for name, value in (("CHUNK", chunk), ("BLOCK", block), ("GROUP", group), ("GROUP_TILES", group_tiles), ("WORTH_WORKERS", 0)):
         monkeypatch.setattr(blocks, name, value)
-    got = run()
+    with threads(1):
+        got = run()
     assert_close(got[:2], want[:2], 1e-14)
     assert_close(got[2:], want[2:], 1e-12)
-    monkeypatch.setattr(blocks, "WORTH_WORKERS", 0)
     with threads(2):
         assert_same_bits(run(), got)
 
@@ -343,26 +340,6 @@ def test_float32_stays_within_its_rounding_errors(tile: int) -> None:
     v32, v64 = (torch.autograd.grad([(image * calm[..., None]).sum() + (alpha * calm).sum()], inputs)
                 for (image, alpha), inputs in ((got, inputs32), (want, inputs64)))
     assert_close(v32, v64, 2 * error)
-
-
-class Peak(TorchDispatchMode):
-    """The most bytes of tensors, made while it is active, that were alive at the same time."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.alive: dict[int, tuple[StorageWeakRef, int]] = {}
-        self.peak = 0
-
-    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run the function and count."""
-        result = function(*args, **(kwargs or {}))
-        for tensor in tree_leaves(result):
-            if isinstance(tensor, Tensor):
-                storage = tensor.untyped_storage()
-                self.alive[storage._cdata] = StorageWeakRef(storage), storage.nbytes()
-        self.alive = {k: v for k, v in self.alive.items() if not v[0].expired()}
-        self.peak = max(self.peak, sum(size for _, size in self.alive.values()))
-        return result
 
 
 def peaks(n: int, side: int) -> tuple[int, int]:

@@ -21,6 +21,9 @@ from tsplat_reference.camera import join_intrinsics, split_intrinsics
 from tsplat_reference.spheres import SphereImages
 from tsplat_reference.walk import Chunk, Memory, TileLists
 
+MISSED = 1e30
+"""|c x m|^2 of padding: more than any |m|^2, so that no ray hits it."""
+
 
 class SphereGradients(NamedTuple):
     """Gradients, shaped as the inputs of `blend_spheres`."""
@@ -86,7 +89,7 @@ class SphereScene:
             beyond = bool((distance - R).amin() < self.near) or bool(distance.amax() > self.far) or bool((z - R).amin() < 0)
         quadratic, linear = self._coefficients(record, rays)
         quadratic.masked_fill_(chunk.padding[:, None], 0.0)
-        quadratic[:, 0].masked_fill_(chunk.padding, 2.0)                                    # t = 2: missed
+        quadratic[:, 0].masked_fill_(chunk.padding, MISSED)
         return SphereGroup(chunk, rays, rows, record, features, quadratic, linear, mono2, mono1, distance, k0, k1, beyond)
 
     def _norm2(self, rays: Rays) -> Tensor:

@@ -20,6 +20,7 @@ class Target:
 
     lanes: int      # threads of a warp (64 on CDNA)
     ptx: bool       # whether NVIDIA's inline assembly is understood
+    predicates: bool = False    # whether the compiler makes a predicated instruction of a sum and a select
 
     @property
     def family(self) -> str:
@@ -43,7 +44,8 @@ def current_target() -> Target:
 def _target(driver: Any, device: Any) -> Target:
     """Held, as to ask for a device's properties takes 5 us, and is done some ten times in a forward and backward."""
     target = driver.get_current_target()
-    return Target(target.warp_size, target.backend == "cuda")
+    nvidia = target.backend == "cuda"
+    return Target(target.warp_size, nvidia, nvidia and target.arch == 90)
 
 
 class Launcher:

@@ -32,7 +32,7 @@ def glue(a, b):
 @triton.jit
 def block_pixels(block, lane_x, tiles_x, tiles_y, W, H, LANES: tl.constexpr):
     """The tiles of a block, 2 in each row of it, and a lane's pixels: camera, tile, whether it exists, its left and its top `[LANES, 1]`,
-    x `[LANES, 8]` and y `[LANES, 1]` about its centre, and of every second pixel the column and the index `[LANES, 4]`.
+    x about its centre `[LANES, 8]`, y `[LANES, 1]`, and of every second pixel the column and the index `[LANES, 4]`.
 
     x is loaded rather than made by tl.arange: that anchors the layout with a lane's pixels in its own registers, and all state is derived
     from it (tl.zeros would get another layout and the compiler would run the loop twice).
@@ -54,7 +54,7 @@ def block_pixels(block, lane_x, tiles_x, tiles_y, W, H, LANES: tl.constexpr):
     exists = (tile_x < tiles_x) & (tile_y < tiles_y)
     tile = (view.to(tl.int64) * tiles_y + tile_y) * tiles_x + tile_x
     dt: tl.constexpr = x4.dtype
-    return view, tile, exists, tile_x * TILE, tile_y * TILE, glue(x4, x4 + 1.0), row.to(dt) - (half - 0.5), column4, pixel4
+    return view, tile, exists, tile_x * TILE, tile_y * TILE, glue(x4, x4 + 1.0), y.to(dt) + 0.5, column4, pixel4
 
 
 @triton.jit
@@ -78,6 +78,43 @@ def half_pixels(view, left, top, W, H, first: tl.constexpr):
 def halves(v):
     """The left and the right 4 pixels of each lane's row, each `[LANES, 4]`."""
     return tl.split(tl.permute(tl.reshape(v, (v.shape[0], 2, 4)), (0, 2, 1)))
+
+
+@triton.jit
+def eighths(v):
+    """Each of a lane's 8 pixels, as `[LANES, 1]`."""
+    even, odd = tl.split(tl.reshape(v, (v.shape[0], 4, 2)))
+    v04, v26 = tl.split(tl.reshape(even, (v.shape[0], 2, 2)))
+    v15, v37 = tl.split(tl.reshape(odd, (v.shape[0], 2, 2)))
+    v0, v4 = tl.split(v04)
+    v1, v5 = tl.split(v15)
+    v2, v6 = tl.split(v26)
+    v3, v7 = tl.split(v37)
+    return v0[:, None], v1[:, None], v2[:, None], v3[:, None], v4[:, None], v5[:, None], v6[:, None], v7[:, None]
+
+
+@triton.jit
+def row_dot(a, b):
+    """Sum of a b over a lane's pixels in 8 operations: tl.sum adds them up as a tree, in which only half of the products can be fused (12)."""
+    a = eighths(a)
+    b = eighths(b)
+    total = a[0] * b[0]
+    for k in tl.static_range(1, 8):
+        total += a[k] * b[k]
+    return total
+
+
+@triton.jit
+def row_moments(v):
+    """Sums over a lane's pixels of v, v x and v x^2, x about the tile's centre, in 19 operations: sums and differences of the pixels that
+    mirror each other, as x and x^2 are the same constants for both (with x in registers 31)."""
+    v0, v1, v2, v3, v4, v5, v6, v7 = eighths(v)
+    s0 = v4 + v3
+    s1 = v5 + v2
+    s2 = v6 + v1
+    s3 = v7 + v0
+    x = 0.5 * (v4 - v3) + 1.5 * (v5 - v2) + 2.5 * (v6 - v1) + 3.5 * (v7 - v0)
+    return s0 + s1 + s2 + s3, x, 0.25 * s0 + 2.25 * s1 + 6.25 * s2 + 12.25 * s3
 
 
 @triton.jit

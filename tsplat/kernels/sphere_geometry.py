@@ -19,7 +19,7 @@ from torch import Tensor
 
 from tsplat.kernels.footprint import SUMS, TILE, store4
 from tsplat.kernels.launch import Launcher, ceil_div, launch
-from tsplat.kernels.tiles import load4
+from tsplat.kernels.tiles import load4, row_dot
 
 CHANNELS = 4
 """Up to here a sphere's features are in its record and a pixel's in registers."""
@@ -124,6 +124,15 @@ def total(v, AXIS: tl.constexpr):
 
 
 @triton.jit
+def dot(a, b, AXIS: tl.constexpr):
+    """Sum of a b over pixels."""
+    if AXIS == 1:
+        return row_dot(a, b)
+    else:
+        return tl.sum(a * b, AXIS, keep_dims=True)
+
+
+@triton.jit
 def term_gradients(g, e, v_depth, t, s, h, a, D, mx, my, w, x, y, z, R, r, o, distance, slope, inv_gamma, depth0, depth1,
                    EPS: tl.constexpr, AXIS: tl.constexpr, ORTHO: tl.constexpr, CHORD: tl.constexpr, PTX: tl.constexpr):
     """Gradients of the centre (3), the radius, the opacity and gamma, summed over pixels; and of mx and my.
@@ -138,7 +147,7 @@ def term_gradients(g, e, v_depth, t, s, h, a, D, mx, my, w, x, y, z, R, r, o, di
     ge = g * e
     v_e = ge * d
     sum_e = total(v_e, AXIS)
-    sum_ez = (depth0 * sum_e - depth1 * total(v_e * D, AXIS)) * inv_gamma                   # z/gamma is depth0 - depth1 D, over gamma
+    sum_ez = (depth0 * sum_e - depth1 * dot(v_e, D, AXIS)) * inv_gamma                   # z/gamma is depth0 - depth1 D, over gamma
     v_o = sum_e + o * sum_ez
     v_gamma = -(o * o) * inv_gamma * sum_ez
     along = ge * slope                                                                      # dL/dD over o d
@@ -160,7 +169,7 @@ def term_gradients(g, e, v_depth, t, s, h, a, D, mx, my, w, x, y, z, R, r, o, di
     else:
         v_t += v_s2
     u = v_t * (2.0 * r * r)
-    v_R = -o * (total(v_D * h, AXIS) + R * total(u * t, AXIS))
+    v_R = -o * (dot(v_D, h, AXIS) + R * dot(u, t, AXIS))
     if ORTHO:
         v_mx = u * (mx - x)
         v_my = u * (my - y)
@@ -171,10 +180,10 @@ def term_gradients(g, e, v_depth, t, s, h, a, D, mx, my, w, x, y, z, R, r, o, di
         k = (v_a - u * a) * w                           # dt/dc = 2/R^2 (c - a w m), da/dc = w m
         S = total(u, AXIS)
         if CHORD:
-            S += total(v_ratio * a, AXIS) / (distance * distance * distance)
+            S += dot(v_ratio, a, AXIS) / (distance * distance * distance)
         K = total(k, AXIS)
-        v_x = o * (x * S + total(k * mx, AXIS))
-        v_y = o * (y * S + (my * K if AXIS == 1 else total(k * my, AXIS)))                  # a lane's pixels have one my
+        v_x = o * (x * S + dot(k, mx, AXIS))
+        v_y = o * (y * S + (my * K if AXIS == 1 else dot(k, my, AXIS)))                  # a lane's pixels have one my
         v_z = o * (z * S + K)
         aw = a * w
         v_mx = k * (x - aw * mx)                        # dt/dm = -2/R^2 a/w (c - a w m), da/dm = w (c - a w m)

@@ -39,7 +39,7 @@ def nearest_kernel(records, ids, offsets, Ks, found, lane_x, W, H, tiles_x, tile
     view, tile, exists, left, top, x, y, column4, pixel4 = block_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
     dt: tl.constexpr = x.dtype
     half: tl.constexpr = TILE / 2
-    mx, my, w, w2 = rays(Ks, view, x + (left.to(dt) + half), y + (top.to(dt) + half), ORTHO)
+    mx, my, w, w2 = rays(Ks, view, x + (left.to(dt) + half), y, ORTHO)
     n = tl.full((), near, dt)
     f = tl.full((), far, dt)
     column = glue(column4, column4 + 1)

@@ -41,6 +41,7 @@ from tsplat.kernels.tiles import (
     load_pixels,
     of_batch,
     prefetch_records,
+    row_dot,
     store_channels,
     tile_list,
     tile_min,
@@ -58,7 +59,7 @@ def sphere_fwd_kernel(records, ids, offsets, backgrounds, gamma, Ks, image, dept
     view, tile, exists, left, top, x, y, column4, pixel4 = block_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
     dt: tl.constexpr = x.dtype
     half: tl.constexpr = TILE / 2
-    mx, my, w, w2 = rays(Ks, view, x + (left.to(dt) + half), y + (top.to(dt) + half), ORTHO)
+    mx, my, w, w2 = rays(Ks, view, x + (left.to(dt) + half), y, ORTHO)
     n, f, level, slope, scale = depth_slope(gamma, near, far, dt)
     b = backgrounds + view * D
     peak = x * 0.0 + tl.full((), background_depth, dt) * scale          # logarithms are to base 2
@@ -149,7 +150,7 @@ def sphere_bwd_kernel(records, ids, offsets, used, gamma, Ks, cutoff, logsumexp,
     view, tile, exists, left, top, x, y, column4, pixel4 = block_pixels(block, lane_x, tiles_x, tiles_y, W, H, LANES)
     dt: tl.constexpr = x.dtype
     half: tl.constexpr = TILE / 2
-    mx, my, w, w2 = rays(Ks, view, x + (left.to(dt) + half), y + (top.to(dt) + half), ORTHO)
+    mx, my, w, w2 = rays(Ks, view, x + (left.to(dt) + half), y, ORTHO)
     n, f, level, slope, scale = depth_slope(gamma, near, far, dt)
     inv_gamma = 1.0 / tl.load(gamma)
     depth1 = 1.0 / (f - n)
@@ -208,12 +209,12 @@ def sphere_bwd_kernel(records, ids, offsets, used, gamma, Ks, cutoff, logsumexp,
                 v_mx += pixel_mx
                 v_my += pixel_my
             weight = e - e * s
-            w0 = o * tl.sum(weight * v0, 1, keep_dims=True)
-            w1 = o * tl.sum(weight * v1, 1, keep_dims=True) if D > 1 else none
-            w2_ = o * tl.sum(weight * v2, 1, keep_dims=True) if D > 2 else none
-            w3 = o * tl.sum(weight * v3, 1, keep_dims=True) if D > 3 else none
+            c0 = o * row_dot(weight, v0)
+            c1 = o * row_dot(weight, v1) if D > 1 else none
+            c2 = o * row_dot(weight, v2) if D > 2 else none
+            c3 = o * row_dot(weight, v3) if D > 3 else none
             COUNT: tl.constexpr = 12 if D > 3 else 9
-            first, slot, second, second_slot, has_second = tile_sums(s0, s1, s2, s3, s4, s5, w0, w1, w2_, w3, none, none, COUNT, PTX)
+            first, slot, second, second_slot, has_second = tile_sums(s0, s1, s2, s3, s4, s5, c0, c1, c2, c3, none, none, COUNT, PTX)
             if PER_HIT:
                 q = sums + (start + i + u) * SUMS
                 tl.store(q + slot, first, mask=real)

@@ -203,7 +203,7 @@ def sphere_bwd_kernel(records, ids, offsets, used, gamma, Ks, cutoff, logsumexp,
             if v_depth is not None:
                 g += distance_in * v_z
             s0, s1, s2, s3, s4, s5, pixel_mx, pixel_my = term_gradients(
-                g, e, v_z, t, s, h, a, distance_in, mx, my, w, X, Y, depth, R, r, o, distance, -(o * depth1) * inv_gamma, inv_gamma,
+                g, e, v_z, t, s, h, a, distance_in, mx, my, w, w2, X, Y, depth, R, r, o, distance, -(o * depth1) * inv_gamma, inv_gamma,
                 depth0, depth1, EPS, 1, ORTHO, CHORD, PTX)
             if v_rays is not None:
                 v_mx += pixel_mx

@@ -199,7 +199,7 @@ def markdown(report: dict[str, Any], figure: str | None) -> str:
     """The report as a table."""
     gpu = report["device"] != "cpu"
     lines = [f"# Spheres: {report['machine']}, {report['date']}, commit {report['commit']}", "",
-             f"`{report['command']}`, torch {report['torch']}, float32, {'CUDA events' if gpu else str(report['threads']) + ' threads'}. "
+             f"`{report['command']}`, torch {report['torch']}, float32, {'CUDA events' if gpu else str(report['threads']) + ' threads'}, repetitions: {report['times']}. "
              "What is measured stands at the head of `bench/spheres.py`.", "",
              "| set-up | spheres | radius | size | tolerance | hits (M) | pairs (M) | fwd ms | bwd ms | CPU ms, fwd / bwd | goal "
              "| fwd M pairs/s | bwd M pairs/s | fwd MiB | fwd+bwd MiB |", "| --- " * 15 + "|"]
@@ -244,6 +244,7 @@ def main() -> None:
     times = args.times or (20 if args.device == "cuda" else 1 if args.large else 3)
     report = environment(args.device, args.threads)
     report["command"] = "python bench/spheres.py" + (" --quick" if args.quick else "")
+    report["times"] = times
     report["rows"] = []
     name = "cpu" if args.device == "cpu" else report["machine"].removeprefix("NVIDIA ").lower().replace(" ", "-")
     stem = args.out / f"{report['date']}-spheres-{name}"

@@ -25,7 +25,7 @@ import tsplat
 from tsplat.fit.spheres import visibility
 
 DISTANCE, FOV = 3.0, 42.0
-GAMMA = 0.5, 5e-3
+GAMMA = 0.5, 2e-2
 SHARP = 2e-3                # gamma of the targets
 LIGHTS = normalize(torch.tensor([[1.0, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]]), dim=1)
 COLORS = torch.tensor([[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8], [0.4, 0.4, 0.4]])

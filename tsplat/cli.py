@@ -1,4 +1,4 @@
-"""The command line: `tsplat fit`, `tsplat render`, `tsplat info`."""
+"""The command line: `tsplat fit`, `tsplat render`, `tsplat convert`, `tsplat info`."""
 
 from __future__ import annotations
 
@@ -19,12 +19,14 @@ import tsplat
 from tsplat.camera import Camera
 from tsplat.fit import FitConfig, draw, fit
 from tsplat.scene import Gaussians, load_capture, write_image, write_synthetic_capture
+from tsplat.scene.formats import FORMATS, find_format, is_sog
 
 INTERRUPTED = 130                    # the exit status of a shell's command that was stopped by Ctrl-C
 AXES = {sign + axis: tuple(float(f"{sign}1") * (axis == a) for a in "xyz") for sign in ("", "-") for axis in "xyz"}
 SIZE = (800, 600)
 ELEVATION = 20.0                     # degrees above the horizon, for cameras that frame the scene
 FRAMED = 0.95                        # part of the splats to be in the picture; the others may be far away
+SCENE = f"a scene file ({', '.join(item.suffix for item in FORMATS)})"
 QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 
 
@@ -43,7 +45,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as interrupt:
         print(f"tsplat: {interrupt or 'interrupted'}", file=sys.stderr)
         return INTERRUPTED
-    except (ValueError, OSError, ArithmeticError, NotImplementedError, MemoryError) as error:
+    except (ValueError, OSError, ArithmeticError, NotImplementedError, MemoryError, ImportError) as error:
         if debug:
             raise
         print(f"tsplat: error: {_text(error)}", file=sys.stderr)
@@ -58,13 +60,14 @@ def _text(error: Exception) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="tsplat", description="Fit, render and inspect scenes of Gaussian splats.")
+    parser = argparse.ArgumentParser(prog="tsplat", description="Fit, render, convert and inspect scenes of Gaussian splats.")
     parser.add_argument("--version", action="version", version=f"tsplat {tsplat.__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     shared = argparse.ArgumentParser(add_help=False)
     shared.add_argument("--debug", action="store_true", help="show where an error came from (also: TSPLAT_DEBUG=1)")
     _add_fit(commands.add_parser("fit", parents=[shared], help="fit a scene to photos"))
     _add_render(commands.add_parser("render", parents=[shared], help="render a scene to PNG"))
+    _add_convert(commands.add_parser("convert", parents=[shared], help="write a scene in another file format"))
     _add_info(commands.add_parser("info", parents=[shared], help="say what is in a scene file or a folder of photos"))
     return parser
 
@@ -95,7 +98,7 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
 
 def _add_render(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_render)
-    parser.add_argument("scene", metavar="SCENE", help="a scene file (.ply)")
+    parser.add_argument("scene", metavar="SCENE", help=SCENE)
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT.png", help="picture to write; its folder is made")
     view = parser.add_mutually_exclusive_group()
     view.add_argument("--camera", metavar="DATA", help="take a camera of this capture (folder or transforms.json)")
@@ -109,9 +112,16 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     _add_device(parser)
 
 
+def _add_convert(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(run=_convert)
+    parser.description = "Write a scene in the format that the name of OUT says; its folder is made."
+    parser.add_argument("scene", metavar="IN", help=SCENE)
+    parser.add_argument("out", type=Path, metavar="OUT", help=f"a scene file ({', '.join(item.suffix for item in FORMATS if item.write)})")
+
+
 def _add_info(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_info)
-    parser.add_argument("path", type=Path, metavar="PATH", help="a scene file (.ply), a capture folder or a transforms.json")
+    parser.add_argument("path", type=Path, metavar="PATH", help=f"{SCENE}, a capture folder or a transforms.json")
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
@@ -189,9 +199,17 @@ def _framing_cameras(means: Tensor, count: int, up: tuple[float, ...], size: tup
     return cameras
 
 
+def _convert(options: argparse.Namespace) -> None:
+    out: Path = options.out
+    gaussians = Gaussians.load(options.scene)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    gaussians.save(out)
+    print(f"{len(gaussians)} splats: {out} ({out.stat().st_size} bytes)")
+
+
 def _info(options: argparse.Namespace) -> None:
     path: Path = options.path
-    if path.is_dir() or path.suffix.lower() == ".json":
+    if (path.is_dir() or path.suffix.lower() == ".json") and not is_sog(path):
         _print_capture(path)
     else:
         _print_scene(path)
@@ -199,6 +217,7 @@ def _info(options: argparse.Namespace) -> None:
 
 def _print_scene(path: Path) -> None:
     gaussians = Gaussians.load(path)
+    print(f"format   {find_format(path).name}")
     print(f"splats   {len(gaussians)}, spherical harmonics of degree {gaussians.sh_degree}")
     finite = torch.stack([p.detach().flatten(1).isfinite().all(1) if p.ndim > 1 else p.isfinite() for p in gaussians.parameters()])
     good = finite.all(0)

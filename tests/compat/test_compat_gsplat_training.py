@@ -207,7 +207,7 @@ def test_a_loop_with_the_default_strategy(packed: bool, absgrad: bool, capsys: p
     params = parameters(40)
     del params["labels"]
     optimizers = adam(params)
-    strategy = DefaultStrategy(refine_start_iter=5, refine_every=10, reset_every=60, refine_stop_iter=70, grow_grad2d=3e-4, prune_opa=0.2,
+    strategy = DefaultStrategy(refine_start_iter=5, refine_every=10, reset_every=60, refine_stop_iter=70, grow_grad2d=1e-3, prune_opa=0.2,
                                refine_scale2d_stop_iter=70, absgrad=absgrad, verbose=True)
     strategy.check_sanity(params, optimizers)
     state = strategy.initialize_state(scene_scale=1.0)

@@ -12,6 +12,7 @@ from typing import Any
 import numpy
 import pytest
 import torch
+from backends import Backend, reference_again
 from compare import assert_close, error, leaves
 from scenes import camera, generator, splats, uniform
 from torch import Tensor
@@ -366,6 +367,24 @@ def test_covariances_instead_of_quats_and_scales() -> None:
     assert_close(got, want, 1e-10)
     names = [args[k] for k in ("means", "quats", "scales")]
     assert_close(torch.autograd.grad(loss_of(got), names), torch.autograd.grad(loss_of(want), names), 1e-9)
+
+
+def test_on_the_kernels(backend: Backend) -> None:
+    """The Triton kernels take what this makes of the arguments: batches, packed rows, and lists of larger tiles."""
+    args = {k: backend.put(v.detach()) if isinstance(v, Tensor) else v for k, v in scene(5).items()}
+    want = {k: v.detach().cpu() if isinstance(v, Tensor) else v for k, v in args.items()}
+    with reference_again():
+        image, alpha, _ = rasterization(**want, render_mode="RGB+ED", absgrad=True)
+    for packed in (True, False):
+        leaf = args["means"].clone().requires_grad_()
+        got, got_alpha, meta = rasterization(**(args | {"means": leaf}), render_mode="RGB+ED", packed=packed, absgrad=True)
+        assert_close([got, got_alpha], [image, alpha], 1e-12)
+        got.sum().backward()
+        assert meta["means2d"].absgrad.shape == meta["means2d"].shape
+        colors = args["colors"][meta["gaussian_ids"]] if packed else args["colors"].expand(2, -1, -1)
+        staged, _ = rasterize_to_pixels(meta["means2d"], meta["conics"], colors, meta["opacities"], 24, 17, 16, meta["isect_offsets"],
+                                        meta["flatten_ids"], packed=packed)
+        assert_close(staged, image[..., :3], 1e-12)
 
 
 def test_radius_clip_leaves_out_the_small() -> None:

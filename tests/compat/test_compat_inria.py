@@ -10,6 +10,7 @@ from typing import Any
 import plain_inria
 import pytest
 import torch
+from backends import Backend, reference_again
 from compare import assert_close, leaves
 from torch import Tensor
 
@@ -108,6 +109,18 @@ def test_images_radii_depths_and_gradients(harmonics: bool, covariances: bool, a
     for name, got, gradient in zip(arguments, found, expected, strict=True):
         assert gradient.abs().max() > 0, name
         assert_close(got, gradient, 1e-10)
+
+
+def test_on_the_kernels(backend: Backend) -> None:
+    """The Triton kernels take what this makes of the arguments."""
+    s, v = settings(image_height=15, image_width=21), scene()
+    arguments = {k: t.detach()[:12] for k, t in v.arguments(True, False).items()}
+    with reference_again():
+        want = GaussianRasterizer(s)(**arguments)
+    on = GaussianRasterizationSettings(*(backend.put(x) for x in s))
+    got = GaussianRasterizer(on)(**{k: backend.put(t) for k, t in arguments.items()})
+    assert torch.equal(got[1].cpu(), want[1])
+    assert_close([got[0], got[2]], [want[0], want[2]], 1e-12)
 
 
 def test_what_inria_cuts_off_at_its_tiles() -> None:

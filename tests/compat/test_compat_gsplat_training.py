@@ -199,8 +199,7 @@ def render(params: Any, cam: Camera, **options: Any) -> tuple[Tensor, Tensor, An
                          cam.viewmats[None], cam.Ks[None], WIDTH, HEIGHT, **options)
 
 
-@pytest.mark.parametrize("packed", [True, False])
-@pytest.mark.parametrize("absgrad", [True, False])
+@pytest.mark.parametrize(("packed", "absgrad"), [(True, False), (False, True)])
 def test_a_loop_with_the_default_strategy(packed: bool, absgrad: bool, capsys: pytest.CaptureFixture[str]) -> None:
     """The loop of gsplat's docstring: Gaussians come and go, opacities are reset, and the loss falls."""
     target, cam = target_and_camera()

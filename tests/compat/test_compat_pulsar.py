@@ -332,6 +332,17 @@ def test_gradients_of_everything(length: int) -> None:
     assert torch.autograd.gradcheck(function, inputs, fast_mode=True)
 
 
+def test_no_spheres() -> None:
+    """The background, no hits, and an info that says so."""
+    nothing = {k: v[:0] for k, v in scene().items()}
+    renderer, background = Renderer(8, 6, 5), torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
+    image, info = renderer(**nothing, cam_params=CAMERA, **OPTIONS, bg_col=background, return_forward_info=True)
+    assert_close(image, background.expand(6, 8, 3), 0.0)
+    assert (Renderer.sphere_ids_from_result_info_nograd(info) == -1).all()
+    assert (Renderer.depth_map_from_result_info_nograd(info) == -1).all()
+    assert (renderer(**nothing, cam_params=CAMERA, **OPTIONS, mode=1) == 0).all()
+
+
 def test_arguments_that_are_wrong() -> None:
     renderer, spheres = Renderer(8, 6, 6), scene()
     for change, message in (({"cam_params": CAMERA[:7]}, "cam_params: expected 8, 10, 11 or 13"), ({"mode": 2}, "mode: expected one of 0, 1"),

@@ -203,8 +203,8 @@ class Renderer(torch.nn.Module):
         hit = ids >= 0
 
         def take(values: Tensor) -> Tensor:
-            """Of `[(B,) N]`, those of the hits `[B, H, W, n]`."""
-            return values.expand(len(ids), -1).gather(1, ids.clamp_min(0).long().flatten(1)).view(ids.shape)
+            """Of `[(B,) N]`, those of the hits `[B, H, W, n]`; N may be 0."""
+            return torch.nn.functional.pad(values, (0, 1)).expand(len(ids), -1).gather(1, ids.clamp_min(0).long().flatten(1)).view(ids.shape)
 
         exponents = (1 - (depths - near) / (far - near)) / gamma
         exponents = exponents if scene.opacities is None else take(scene.opacities) * exponents

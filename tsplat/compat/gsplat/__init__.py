@@ -20,8 +20,8 @@ with these differences:
 `NotImplementedError`.
 """
 
-from tsplat.compat.gsplat.export import export_splats as export_splats
-from tsplat.compat.gsplat.optimizer import SelectiveAdam as SelectiveAdam
+from tsplat.compat.gsplat.exporter import export_splats as export_splats
+from tsplat.compat.gsplat.optimizers import SelectiveAdam as SelectiveAdam
 from tsplat.compat.gsplat.rendering import RollingShutterType as RollingShutterType
 from tsplat.compat.gsplat.rendering import rasterization as rasterization
 from tsplat.compat.gsplat.stages import fully_fused_projection as fully_fused_projection

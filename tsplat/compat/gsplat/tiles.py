@@ -35,7 +35,7 @@ def isect_tiles(means2d: Tensor, radii: Tensor, depths: Tensor, tile_size: int, 
     if packed and (image_ids is None or n_images is None):
         raise ValueError("n_images, image_ids: expected both with packed=True; got None")
     count = means2d.shape[-2]
-    images = torch.arange(math.prod(means2d.shape[:-2]), device=means2d.device).repeat_interleave(count) if image_ids is None else image_ids
+    images = torch.arange(math.prod(means2d.shape[:-2]), device=means2d.device).repeat_interleave(count) if image_ids is None else image_ids.long()
     center, half = means2d.reshape(-1, 2) / tile_size, radii.reshape(-1, 2) / tile_size
     last = torch.tensor([tile_width, tile_height], device=means2d.device)
     low = torch.minimum((center - half).floor().clamp_min(0).long(), last)

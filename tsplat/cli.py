@@ -83,10 +83,14 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     _add_device(parser)
     kinds = typing.get_type_hints(FitConfig)
     for item in dataclasses.fields(FitConfig):
-        kind, text = kinds[item.name], f"{item.metadata['help']} (default: {item.default})"
+        kind, text = kinds[item.name], item.metadata["help"]
+        if item.default is None:                                                     # `kind | None`, of which the help says what None means
+            kind = next(k for k in typing.get_args(kind) if k is not type(None))
+        else:
+            text = f"{text} (default: {item.default:g})" if kind is float else f"{text} (default: {item.default})"
         flag = "--" + item.name.replace("_", "-")
         if kind is bool:
-            parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=item.default, help=item.metadata["help"])
+            parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=item.default, help=text)
         elif choices := typing.get_args(kind):
             parser.add_argument(flag, choices=choices, default=item.default, help=text)
         else:

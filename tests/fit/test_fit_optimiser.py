@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from tsplat.fit import FitConfig
-from tsplat.fit.optimiser import learning_rates, make_adam, set_rates, sh_degree_at
+from tsplat.fit.optimiser import learning_rates, make_adam, set_rates
+from tsplat.fit.schedules import sh_degree_at
 from tsplat.scene import Gaussians
 
 Make = Callable[..., FitConfig]

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import torch
 
 from tsplat.fit.config import FitConfig
-from tsplat.fit.drawing import draw, fixed_background
+from tsplat.fit.drawing import fixed_background
 from tsplat.fit.losses import psnr, ssim, target_of
-from tsplat.scene import Capture, Gaussians, write_image
+from tsplat.fit.primitive import Scene, primitive_of
+from tsplat.scene import Capture, write_image
 
 
 class Quality(NamedTuple):
@@ -22,12 +23,12 @@ class Quality(NamedTuple):
 
 
 @torch.no_grad()
-def evaluate(gaussians: Gaussians, capture: Capture, views: Sequence[int], config: FitConfig, pictures: Path | None = None
+def evaluate(gaussians: Scene, capture: Capture, views: Sequence[int], config: FitConfig, pictures: Path | None = None
              ) -> dict[str, Quality]:
     """Compare renders, clamped to 0..1, with photos `views` of a capture.
 
     Args:
-        config: `background` and `antialiased` of it are used.
+        config: `primitive`, `background` and `antialiased` of it are used.
         pictures: an existing folder for one PNG per photo: the photo on the left, the render on the right.
 
     Returns:
@@ -35,10 +36,10 @@ def evaluate(gaussians: Gaussians, capture: Capture, views: Sequence[int], confi
     """
     device = gaussians.means.device
     background = fixed_background(config).to(device)
-    qualities = {}
+    primitive, qualities = primitive_of(config), {}
     for view in views:
         target = target_of(capture.images[view].to(device), background, masked=capture.masked)
-        image = draw(gaussians, capture.camera(view).to(device), background, antialiased=config.antialiased).image.clamp(0, 1)
+        image = primitive.draw(gaussians, capture.camera(view).to(device), background, config).image.clamp(0, 1)
         qualities[capture.names[view]] = Quality(float(psnr(image, target)), float(ssim(image, target)))
         if pictures is not None:
             write_image(pictures / picture_name(capture.names[view]), torch.cat([target.image, image], dim=1))

@@ -133,6 +133,8 @@ def _fit(options: argparse.Namespace) -> None:
     result = fit(data, config, options.out, resume=not options.fresh, progress=not options.quiet, device=_device(options.device))
     if result.mean is not None:
         print(f"{len(result.qualities)} held-out photos: PSNR {result.mean.psnr:.2f} dB, SSIM {result.mean.ssim:.4f}")
+    if result.refined_mean is not None:
+        print(f"with their poses refined, too: PSNR {result.refined_mean.psnr:.2f} dB, SSIM {result.refined_mean.ssim:.4f}")
     print(f"{len(result.gaussians)} splats after {config.steps} steps in {result.seconds:.0f} s: {options.out / 'scene.ply'}")
 
 

@@ -11,7 +11,7 @@ from tsplat.fit.checkpoint import read_checkpoint
 from tsplat.fit.config import FitConfig
 from tsplat.fit.evaluation import Quality, mean_quality
 from tsplat.fit.losses import SSIM_NAME
-from tsplat.scene import Gaussians
+from tsplat.fit.primitive import Scene
 from tsplat.scene.files import replacing
 
 
@@ -42,13 +42,17 @@ class Output:
                                   "beside it); choose another folder")
         return None
 
-    def write(self, gaussians: Gaussians, config: FitConfig, qualities: dict[str, Quality], seconds: float) -> None:
+    def write(self, gaussians: Scene, config: FitConfig, qualities: dict[str, Quality], refined: dict[str, Quality], seconds: float) -> None:
         """Write the scene and its metrics, each whole or not at all."""
         gaussians.save(self.scene)
-        mean = mean_quality(qualities)
+        mean, mean_refined = mean_quality(qualities), mean_quality(refined)
         metrics = {
             "mean": None if mean is None else mean._asdict(),
             "images": {name: quality._asdict() for name, quality in qualities.items()},
+            **({} if mean_refined is None else {
+                "mean_with_refined_poses": mean_refined._asdict(),
+                "images_with_refined_poses": {name: quality._asdict() for name, quality in refined.items()},
+            }),
             "ssim": SSIM_NAME,
             "splats": len(gaussians),
             "seconds": round(seconds, 3),

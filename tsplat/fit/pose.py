@@ -21,6 +21,8 @@ def moved(camera: Camera, increment: Tensor, extent: float) -> Camera:
     from kornia.geometry.liegroup import Se3
 
     step: Tensor = Se3.exp(torch.cat([increment[:3] * extent, increment[3:]])[None]).matrix()[0]        # [4, 4]
+    if not increment.requires_grad:                                # kornia's Se3 makes parameters of what it is given
+        step = step.detach()
     return dataclasses.replace(camera, viewmats=step @ camera.viewmats)
 
 

@@ -16,18 +16,18 @@ from tsplat.camera import Camera
 from tsplat.fit.checkpoint import restore, save_checkpoint
 from tsplat.fit.config import FitConfig
 from tsplat.fit.drawing import step_background
-from tsplat.fit.evaluation import Quality, evaluate, mean_quality
+from tsplat.fit.evaluation import Quality, evaluate, mean_quality, refined_cameras
 from tsplat.fit.interrupt import deferred_interrupt
 from tsplat.fit.losses import Target, depth_loss, photo_loss, psnr, target_of
 from tsplat.fit.memory import check_growth
 from tsplat.fit.optimiser import adam_step, set_rates
 from tsplat.fit.output import Output
-from tsplat.fit.primitive import primitive_of
+from tsplat.fit.primitive import Scene, primitive_of
 from tsplat.fit.progress import progress_line
 from tsplat.fit.schedules import divisor_at
 from tsplat.fit.state import FitState
 from tsplat.fit.stream import PhotoStream
-from tsplat.scene import Capture, Gaussians, load_capture
+from tsplat.scene import Capture, load_capture
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Step:
     photo: str
     loss: float
     psnr: float
-    gaussians: Gaussians
+    gaussians: Scene
 
 
 @dataclass(frozen=True)
@@ -55,11 +55,13 @@ class FitResult:
     Args:
         gaussians: the scene.
         qualities: PSNR and SSIM of the held-out photos, by name.
+        refined: the same with the poses of these photos refined, too, where the fit refined poses; else empty.
         seconds: wall time of the steps, also of those before an interruption.
     """
 
-    gaussians: Gaussians
+    gaussians: Scene
     qualities: dict[str, Quality]
+    refined: dict[str, Quality]
     seconds: float
 
     @property
@@ -67,11 +69,16 @@ class FitResult:
         """Mean quality, or None if no photo was held out."""
         return mean_quality(self.qualities)
 
+    @property
+    def refined_mean(self) -> Quality | None:
+        """Mean quality with refined poses, or None without."""
+        return mean_quality(self.refined)
+
 
 def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None, out: str | os.PathLike[str] | None = None, *,
         resume: bool = True, progress: bool = True, callbacks: Sequence[Callable[[Step], None]] = (),
         device: str | torch.device = "cpu") -> FitResult:
-    """Fit a scene to photos: one photo per step, at random without replacement, Adam on L1 and SSIM.
+    """Fit a scene to photos: one photo per step, at random without replacement, Adam on L1 and SSIM, density control.
 
     Args:
         data: a capture, or the folder of one (see `load_capture`; `downscale` and `test_every` of the config apply to a
@@ -88,7 +95,10 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
     Raises:
         ValueError, FileNotFoundError: bad data, no photo to train on, a checkpoint of another fit.
         FileExistsError: `out` holds a file of one of these names that is not from a fit.
-        FloatingPointError: a loss or gradient that is not finite, naming the step and the photo. The last checkpoint stays.
+        FloatingPointError: a loss or gradient that is not finite, naming the step, the photo and the parameter. The last
+            checkpoint stays.
+        MemoryError: density control would take more memory than is free; before it does. The last checkpoint stays.
+        NotImplementedError: a primitive that cannot be fitted yet.
         OSError: a file cannot be written. The last checkpoint stays.
         KeyboardInterrupt: on Ctrl-C, after the step and a checkpoint; its message says where it is.
     """
@@ -111,9 +121,13 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
         save_checkpoint(output.checkpoint, state, config, capture)
         output.pictures.mkdir(exist_ok=True)
     qualities = evaluate(state.gaussians, capture, capture.test, config, None if output is None else output.pictures)
+    refined = {}
+    if config.refine_poses:
+        cameras = refined_cameras(state.gaussians, capture, capture.test, config)
+        refined = evaluate(state.gaussians, capture, capture.test, config, cameras=cameras)
     if output is not None:
-        output.write(state.gaussians, config, qualities, state.seconds)
-    return FitResult(state.gaussians, qualities, state.seconds)
+        output.write(state.gaussians, config, qualities, refined, state.seconds)
+    return FitResult(state.gaussians, qualities, refined, state.seconds)
 
 
 def start(capture: Capture, config: FitConfig, device: torch.device) -> FitState:

@@ -63,7 +63,7 @@ def assert_follows(scene: nn.Module, adam: Adam | VisibleAdam, fresh: Tensor, bu
 def see(control: Control, scene: Gaussians, pull: Tensor) -> None:
     """One step's worth of observations: each splat that is visible is pulled at by `pull` `[N]`, in NDC."""
     camera = Camera.look_at((0, 0, -6), (0, 0, 0), width=20, height=20)
-    probes = control.probes(scene)
+    probes = control.probes(scene, 1)
     rendering = rasterize(scene.means, scene.quats, scene.scales, scene.opacities, scene.sh, camera, sh_degree=1, **probes)
     for probe in probes.values():
         probe.grad = torch.stack([pull / 10, torch.zeros_like(pull)], -1)[None]
@@ -192,8 +192,11 @@ def test_reset_of_opacities() -> None:
 
 def test_absgrad_asks_the_renderer_for_it() -> None:
     scene = scene_of(3)
-    assert list(AdaptiveControl(1.0, ALWAYS, absgrad=True).probes(scene)) == ["absgrad"]
-    assert list(AdaptiveControl(1.0, ALWAYS).probes(scene)) == ["screen_offset"]
+    assert list(AdaptiveControl(1.0, ALWAYS, absgrad=True).probes(scene, 1)) == ["absgrad"]
+    assert list(AdaptiveControl(1.0, ALWAYS).probes(scene, 1)) == ["screen_offset"]
+    for control in (AdaptiveControl(1.0, Schedule(1, 9, 1)), Budget(1.0, Schedule(1, 9, 1), 3)):
+        assert control.probes(scene, 8)
+        assert not control.probes(scene, 9)                            # of no use any more, and not free
     assert AdaptiveControl(1.0, ALWAYS, absgrad=True).threshold == 4 * AdaptiveControl(1.0, ALWAYS).threshold
 
 
@@ -326,7 +329,7 @@ def test_in_a_loop_of_ones_own() -> None:
         adam = Adam([{"params": [p], "name": name} for name, p in scene.items()], lr=0.03)
         for step in range(1, 81):
             rendering = rasterize(scene["means"], scene["quats"], scene["log_scales"].exp(), scene["opacity_logits"].sigmoid(), scene["sh0"][:, 0],
-                                  camera, **control.probes(scene))
+                                  camera, **control.probes(scene, step))
             loss = (rendering.image - target).abs().mean()
             adam.zero_grad()
             loss.backward()

@@ -87,6 +87,7 @@ class FitConfig:
     lr_sh0: float = field(default=2.5e-3, metadata=_about("learning rate of the constant colour coefficients", 0))
     lr_sh_rest: float = field(default=1.25e-4, metadata=_about("learning rate of the other colour coefficients", 0))
     seed: int = field(default=0, metadata=_about("of all that is random", 0, 2**62))
+    video: int = field(default=0, metadata=_about("frames of a turntable, OUT/turntable.gif; 0: none", 0, decides=False))
     checkpoint_every: int = field(default=500, metadata=_about("steps between checkpoints", 1, decides=False))
 
     def __post_init__(self) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import torch
@@ -14,6 +14,7 @@ from tsplat.fit.density import Control
 from tsplat.fit.optimiser import make_adam
 from tsplat.fit.photos import PhotoParameters
 from tsplat.fit.primitive import Scene, primitive_of
+from tsplat.fit.report import History
 from tsplat.fit.visible_adam import VisibleAdam
 from tsplat.scene import Capture
 
@@ -31,6 +32,7 @@ class FitState:
         step: steps done.
         queue: photos yet to come before all are shuffled anew, last first.
         seconds: wall time spent so far.
+        history: of loss, PSNR and splats.
     """
 
     gaussians: Scene
@@ -41,6 +43,7 @@ class FitState:
     step: int = 0
     queue: list[int] = field(default_factory=list)
     seconds: float = 0.0
+    history: History = field(default_factory=History)
 
     @classmethod
     def of(cls, scene: Scene, capture: Capture, config: FitConfig, generator: torch.Generator) -> FitState:
@@ -59,7 +62,8 @@ class FitState:
         """Tensors and plain values, as `torch.load(..., weights_only=True)` reads them."""
         return {"gaussians": self.gaussians.state_dict(), "adam": self.adam.state_dict(), "control": self.control.state_dict(),
                 "photos": self.photos.state_dict(), "photos_adam": None if self.photos.adam is None else self.photos.adam.state_dict(),
-                "generator": self.generator.get_state(), "step": self.step, "queue": self.queue, "seconds": self.seconds}
+                "generator": self.generator.get_state(), "step": self.step, "queue": self.queue, "seconds": self.seconds,
+                "history": asdict(self.history)}
 
     @classmethod
     def from_state_dict(cls, saved: dict[str, Any], capture: Capture, config: FitConfig, device: torch.device) -> FitState:
@@ -72,4 +76,5 @@ class FitState:
             state.photos.adam.load_state_dict(saved["photos_adam"])
         state.generator.set_state(saved["generator"])
         state.step, state.queue, state.seconds = saved["step"], saved["queue"], saved["seconds"]
+        state.history = History(**saved["history"])
         return state

@@ -16,7 +16,7 @@ from tsplat.camera import Camera
 from tsplat.fit.checkpoint import restore, save_checkpoint
 from tsplat.fit.config import FitConfig
 from tsplat.fit.drawing import step_background
-from tsplat.fit.evaluation import Quality, evaluate, mean_quality, refined_cameras
+from tsplat.fit.evaluation import Quality, evaluate, mean_quality, picture_name, refined_cameras
 from tsplat.fit.interrupt import deferred_interrupt
 from tsplat.fit.losses import Target, depth_loss, photo_loss, psnr, target_of
 from tsplat.fit.memory import check_growth
@@ -24,9 +24,11 @@ from tsplat.fit.optimiser import adam_step, set_rates
 from tsplat.fit.output import Output
 from tsplat.fit.primitive import Scene, primitive_of
 from tsplat.fit.progress import progress_line
+from tsplat.fit.report import write_sheet
 from tsplat.fit.schedules import divisor_at
 from tsplat.fit.state import FitState
 from tsplat.fit.stream import PhotoStream
+from tsplat.fit.turntable import write_turntable
 from tsplat.scene import Capture, load_capture
 
 
@@ -84,12 +86,13 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
         data: a capture, or the folder of one (see `load_capture`; `downscale` and `test_every` of the config apply to a
             folder only).
         config: default `FitConfig()`.
-        out: a folder, made if need be, for `scene.ply`, `metrics.json`, `test/<photo>.png` (held-out photo beside
-            render) and `checkpoint.pt`. Other files in it are left alone. None: nothing is written.
+        out: a folder, made if need be, for `scene.ply`, `metrics.json`, `config.json`, `curves.png`, `test/<photo>.png` (held-out
+            photo beside render), `contact.png` (some of these, with the error), `turntable.gif` (if asked for) and
+            `checkpoint.pt`. Other files in it are left alone. None: nothing is written.
         resume: go on from the checkpoint in `out`, if there is one. A fit that was interrupted and resumed ends, on the same
             machine, with the same bits as one that was not.
         progress: show a line with loss, PSNR and number of splats.
-        callbacks: each is called after each step.
+        callbacks: each is called after each step; `tsplat.fit.to_writer` makes one for TensorBoard.
         device: where to compute.
 
     Raises:
@@ -127,6 +130,11 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
         refined = evaluate(state.gaussians, capture, capture.test, config, cameras=cameras)
     if output is not None:
         output.write(state.gaussians, config, qualities, refined, state.seconds)
+        state.history.write(output.curves)
+        if qualities:
+            write_sheet(output.sheet, [output.pictures / picture_name(name) for name in qualities])
+        if config.video:
+            write_turntable(output.turntable, state.gaussians, capture, config, config.video)
     return FitResult(state.gaussians, qualities, refined, state.seconds)
 
 
@@ -159,7 +167,8 @@ def train_step(state: FitState, capture: Capture, config: FitConfig, images: Pho
                               divisor_at(config, state.step))
     camera = state.photos.camera(camera, view, extent)
     truth = capture.depth(view, camera.width, camera.height) if config.depth_weight else None
-    rendering = primitive.draw(scene, camera, background, config, state.step, depth=truth is not None, probes=state.control.probes(scene))
+    probes = state.control.probes(scene, state.step + 1)
+    rendering = primitive.draw(scene, camera, background, config, state.step, depth=truth is not None, probes=probes)
     loss = photo_loss(state.photos.expose(rendering.image, view), target, config.ssim_weight)
     if truth is not None and rendering.depth is not None:
         loss = loss + config.depth_weight * depth_loss(rendering.depth, rendering.alpha, truth.to(device))
@@ -188,6 +197,7 @@ def _train(state: FitState, capture: Capture, config: FitConfig, output: Output 
         while state.step < config.steps:
             step = train_step(state, capture, config, images)
             show(step.loss, step.psnr, len(state.gaussians))
+            state.history.add(step.number, config.steps, step.loss, step.psnr, len(state.gaussians))
             for callback in callbacks:
                 callback(step)
             state.seconds = before + time.perf_counter() - begin

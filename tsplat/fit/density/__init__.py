@@ -4,7 +4,7 @@ They know parameters and an optimiser, no trainer; in a loop of your own, with a
 
     control = AdaptiveControl(extent, Schedule(500, 15_000, 100))
     for step in range(1, steps + 1):
-        rendering = rasterize(..., **control.probes(scene))
+        rendering = rasterize(..., **control.probes(scene, step))
         optimiser.zero_grad()
         loss(rendering.image).backward()
         control.observe(rendering.meta, camera)

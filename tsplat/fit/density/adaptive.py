@@ -42,9 +42,9 @@ class AdaptiveControl(NoControl):
         self.reset_every, self.settle, self.max_splats = reset_every, settle, max_splats
         self.gradients = ScreenGradients(absgrad)
 
-    def probes(self, scene: nn.Module, cameras: int = 1) -> dict[str, Tensor]:
-        """Of the screen-space gradient."""
-        return self.gradients.probes(scene, cameras)
+    def probes(self, scene: nn.Module, step: int, cameras: int = 1) -> dict[str, Tensor]:
+        """Of the screen-space gradient, up to the end of the schedule."""
+        return self.gradients.probes(scene, cameras) if step < self.schedule.stop else {}
 
     def observe(self, meta: Meta, camera: Camera) -> None:
         """Add the screen-space gradients of one backward pass."""

@@ -38,9 +38,9 @@ class Budget(NoControl):
         self.gradients = ScreenGradients(absolute=True)
         self.first: int | None = None             # splats before the first action
 
-    def probes(self, scene: nn.Module, cameras: int = 1) -> dict[str, Tensor]:
-        """Of the absolute screen-space gradient."""
-        return self.gradients.probes(scene, cameras)
+    def probes(self, scene: nn.Module, step: int, cameras: int = 1) -> dict[str, Tensor]:
+        """Of the absolute screen-space gradient, up to the end of the schedule."""
+        return self.gradients.probes(scene, cameras) if step < self.schedule.stop else {}
 
     def observe(self, meta: Meta, camera: Camera) -> None:
         """Add the screen-space gradients of one backward pass."""

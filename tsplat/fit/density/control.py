@@ -38,8 +38,8 @@ class Control(Protocol):
     is one. Where N changes, its parameters are replaced by new ones, in the module and in the optimiser.
     """
 
-    def probes(self, scene: nn.Module, cameras: int = 1) -> dict[str, Tensor]:
-        """Arguments for `rasterize` that collect what `observe` needs to know."""
+    def probes(self, scene: nn.Module, step: int, cameras: int = 1) -> dict[str, Tensor]:
+        """Arguments for `rasterize` in step `step` (counted from 1) that collect what `observe` needs to know."""
         ...
 
     def observe(self, meta: Meta, camera: Camera) -> None:
@@ -70,7 +70,7 @@ class Control(Protocol):
 class NoControl:
     """The scene keeps its splats. Also what the other kinds have in common."""
 
-    def probes(self, scene: nn.Module, cameras: int = 1) -> dict[str, Tensor]:
+    def probes(self, scene: nn.Module, step: int, cameras: int = 1) -> dict[str, Tensor]:
         """None."""
         return {}
 

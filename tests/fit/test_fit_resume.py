@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 import torch
 
+import tsplat.fit.trainer
 from tsplat.fit import FitConfig, Step, fit
 from tsplat.fit.photos import PhotoParameters
 from tsplat.scene import Capture
@@ -178,3 +179,22 @@ def test_parameter_of_a_photo_that_is_not_finite(capture: Capture, config: Make,
     monkeypatch.setattr(PhotoParameters, "expose", spoilt)
     with pytest.raises(FloatingPointError, match=r"step 1, photo view_00\d\.png: the gradient of exposures is not finite"):
         fit(capture, config(exposure=True), progress=False)
+
+
+def test_failing_before_the_first_checkpoint_writes_one(capture: Capture, config: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of before the step that failed, to the last random number: what goes on from it ends as if nothing had been."""
+    loss, calls = tsplat.fit.trainer.photo_loss, []
+
+    def spoilt(*args: Any) -> torch.Tensor:
+        calls.append(1)
+        return loss(*args) * (float("inf") if len(calls) == 4 else 1.0)
+
+    c = config(background="random")
+    monkeypatch.setattr(tsplat.fit.trainer, "photo_loss", spoilt)
+    with pytest.raises(FloatingPointError, match="step 4, photo"):
+        fit(capture, c, tmp_path / "failed", progress=False)
+    steps: list[Step] = []
+    fit(capture, c, tmp_path / "failed", progress=False, callbacks=[steps.append])
+    assert steps[0].number == 4
+    fit(capture, c, tmp_path / "whole", progress=False)
+    assert (tmp_path / "failed" / "scene.ply").read_bytes() == (tmp_path / "whole" / "scene.ply").read_bytes()

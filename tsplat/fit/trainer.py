@@ -99,8 +99,8 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
         ValueError, FileNotFoundError: bad data, no photo to train on, a checkpoint of another fit.
         FileExistsError: `out` holds a file of one of these names that is not from a fit.
         FloatingPointError: a loss or gradient that is not finite, naming the step, the photo and the parameter. The last
-            checkpoint stays.
-        MemoryError: density control would take more memory than is free; before it does. The last checkpoint stays.
+            checkpoint stays; if there is none yet, one is written.
+        MemoryError: density control would take more memory than is free; before it does. As above.
         NotImplementedError: a primitive that cannot be fitted yet.
         OSError: a file cannot be written. The last checkpoint stays.
         KeyboardInterrupt: on Ctrl-C, after the step and a checkpoint; its message says where it is.
@@ -146,7 +146,7 @@ def start(capture: Capture, config: FitConfig, device: torch.device) -> FitState
 
 
 def train_step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStream | None = None) -> Step:
-    """Render one photo's view, compare, and move the parameters. The scene does not change if it raises.
+    """Render one photo's view, compare, and move the parameters. Nothing changes if it raises.
 
     Args:
         state: of the fit.
@@ -156,6 +156,16 @@ def train_step(state: FitState, capture: Capture, config: FitConfig, images: Pho
     Raises:
         FloatingPointError, MemoryError: see `fit`.
     """
+    before = state.generator.get_state(), list(state.queue)
+    try:
+        return _step(state, capture, config, images)
+    except (FloatingPointError, MemoryError):
+        state.generator.set_state(before[0])
+        state.queue = before[1]
+        raise
+
+
+def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStream | None) -> Step:
     scene, primitive, extent = state.gaussians, primitive_of(config), capture.extent
     device = scene.means.device
     view = state.next_view(capture.train)
@@ -191,11 +201,16 @@ def train_step(state: FitState, capture: Capture, config: FitConfig, images: Pho
 def _train(state: FitState, capture: Capture, config: FitConfig, output: Output | None, progress: bool,
            callbacks: Sequence[Callable[[Step], None]]) -> None:
     """All steps that are left."""
-    before, begin = state.seconds, time.perf_counter()
+    before, begin, kept = state.seconds, time.perf_counter(), state.step > 0      # kept: whether there is a checkpoint of this fit
     with (deferred_interrupt() as interrupt, progress_line(config.steps, state.step, shown=progress) as show,
           PhotoStream(capture.images) as images):
         while state.step < config.steps:
-            step = train_step(state, capture, config, images)
+            try:
+                step = train_step(state, capture, config, images)
+            except (FloatingPointError, MemoryError):
+                if output is not None and not kept:
+                    save_checkpoint(output.checkpoint, state, config, capture)
+                raise
             show(step.loss, step.psnr, len(state.gaussians))
             state.history.add(step.number, config.steps, step.loss, step.psnr, len(state.gaussians))
             for callback in callbacks:
@@ -203,6 +218,7 @@ def _train(state: FitState, capture: Capture, config: FitConfig, output: Output 
             state.seconds = before + time.perf_counter() - begin
             if output is not None and (_due(state, config) or interrupt.requested):
                 save_checkpoint(output.checkpoint, state, config, capture)
+                kept = True
             if interrupt.requested:
                 raise KeyboardInterrupt(f"stopped after step {state.step} of {config.steps}" + (
                     "" if output is None else f"; the same call goes on from {output.checkpoint}"))

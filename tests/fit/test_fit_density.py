@@ -234,6 +234,18 @@ def test_budget_is_spent_on_the_highest_scores() -> None:
     assert_follows(scene, adam, torch.arange(6) >= 3)
 
 
+def test_budget_spares_what_no_view_has_seen() -> None:
+    scene = scene_of(4)
+    with torch.no_grad():
+        scene.opacity_logits.fill_(0.0)
+        scene.means[:2, 2] = -50.0                                     # behind the camera
+    before = scene.means.detach().clone()
+    control = Budget(1e6, ALWAYS, 4, recycled=0.75)                    # three, but only two were seen
+    see(control, scene, torch.tensor([0.0, 0, 1, 2]))
+    control.update(scene, marked(scene), 1, seeded())
+    assert torch.equal(scene.means.detach(), before[[0, 1, 0, 1]])
+
+
 @pytest.mark.parametrize("copies", [1, 2, 3, 7, 51])
 @pytest.mark.parametrize("opacity", [0.01, 0.5, 0.99])
 def test_copies_look_like_the_one(copies: int, opacity: float) -> None:

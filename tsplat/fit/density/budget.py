@@ -17,13 +17,17 @@ from tsplat.rasterize import Meta
 
 MIN_OPACITY = 0.005
 CLONED = 0.01         # of the extent: smaller splats are cloned, others split
+# with as many splats, 0, 2 and 5 % gave 34.82, 34.88 and 34.71 dB for the made-up scene in 500 steps (34.08 without control), 0 and 2 % gave
+# 30.38 and 30.56 dB for fox (29.54)
+RECYCLED = 0.02
 
 
 class Budget(NoControl):
     """The number of splats rises from that at the start to `max_splats`, steadily, as Taming 3DGS (Mallick et al. 2024) does.
 
-    The score of a splat is its mean absolute screen-space gradient. At each action the faint (opacity below 0.005) and the part
-    `recycled` with the lowest scores go; those with the highest are cloned (small ones) or split, until the number is met.
+    The score of a splat is its mean absolute screen-space gradient over the views that saw it since the last action. At each
+    action the part `recycled` with the lowest scores goes, the faint (opacity below 0.005) in any case; those with the highest
+    are cloned (small ones) or split, until the number is met. Splats that no view saw meanwhile have not been judged, and stay.
     Opacities are never reset: what a reset is for, recycling does, and there is no transient.
 
     Args:
@@ -33,7 +37,7 @@ class Budget(NoControl):
         recycled: part of the splats.
     """
 
-    def __init__(self, extent: float, schedule: Schedule, max_splats: int, recycled: float = 0.0) -> None:
+    def __init__(self, extent: float, schedule: Schedule, max_splats: int, recycled: float = RECYCLED) -> None:
         self.extent, self.schedule, self.max_splats, self.recycled = extent, schedule, max_splats, recycled
         self.gradients = ScreenGradients(absolute=True)
         self.first: int | None = None             # splats before the first action
@@ -61,11 +65,12 @@ class Budget(NoControl):
         target = self._target(n, step)
         self.first = self.first if self.first is not None else n
         scores = self.gradients.mean(n, means)
+        seen = self.gradients.seen(n, means)
         self.gradients.clear()
         faint = scene.get_parameter("opacity_logits").sigmoid() < MIN_OPACITY
-        scores[faint] = -1.0
-        dropped = max(int(faint.sum()), int(self.recycled * n), n - target)
-        rows = prune(scene, optimiser, scores.argsort(stable=True).argsort() >= dropped)
+        worth = scores.where(seen, torch.inf).masked_fill(faint, -1.0)
+        dropped = max(int(faint.sum()), min(int(self.recycled * n), int((seen | faint).sum())), n - target)
+        rows = prune(scene, optimiser, worth.argsort(stable=True).argsort() >= dropped)
         scores = scores[rows]
         while 0 < len(scores) < target:           # more than one round where more is missing than there are splats
             parents = scores.topk(min(len(scores), target - len(scores))).indices

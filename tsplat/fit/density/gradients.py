@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 
 from tsplat.camera import Camera
@@ -44,6 +45,10 @@ class ScreenGradients:
         if self.total is None or self.views is None:
             return like.new_zeros(n)
         return (self.total / self.views.clamp(min=1)).to(like)
+
+    def seen(self, n: int, like: Tensor) -> Tensor:
+        """Bool `[n]`: which splats any view saw."""
+        return like.new_zeros(n, dtype=torch.bool) if self.views is None else self.views.to(like.device) > 0
 
     def clear(self) -> None:
         """Start to sum anew."""

@@ -9,7 +9,7 @@ import pytest
 import scenes
 import torch
 import tsplat_reference as reference
-from compare import assert_close
+from compare import assert_close, guarded
 from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton is not installed here")
@@ -33,16 +33,6 @@ class Case:
     @property
     def arguments(self) -> tuple[Tensor | int | float | None, ...]:
         return *self.splats[:5], *self.bins, self.width, self.height, TILE, ALPHA_MAX, self.drop_last
-
-
-def guarded(tensor: Tensor | None) -> Tensor | None:
-    """The same numbers with NaN (or, for indices, numbers far out of range) before and after them in memory."""
-    if tensor is None:
-        return None
-    fill = float("nan") if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max // 2
-    memory = torch.full((tensor.numel() + 128,), fill, dtype=tensor.dtype)
-    inner = memory[64:64 + tensor.numel()].view(tensor.shape)
-    return inner.copy_(tensor)
 
 
 def case(cameras: int, n: int, width: int, height: int, *, dtype: torch.dtype = torch.float64, device: str = "cpu",
@@ -91,6 +81,16 @@ def test_forward_and_backward_agree_with_the_reference(name: str) -> None:
     v_want = reference.blend_blocks_backward(*cpu[:7], *want, *v, *cpu[7:], True)
     v_got = blending.blend_backward(*c.arguments[:7], *(guarded(x).to(DEVICE) for x in (*want, *v)), *c.arguments[7:], True)
     assert_close([g.cpu() for g in v_got], v_want, 1e-12)
+
+
+@pytest.mark.parametrize("predicates", [False, True])
+def test_splats_that_are_not_shown_are_left_out_either_way(monkeypatch: pytest.MonkeyPatch, predicates: bool) -> None:
+    """By a weight of 0, or by a predicate of the sums: one for some targets, one for the others."""
+    target = dataclasses.replace(blending.current_target(), predicates=predicates)
+    monkeypatch.setattr(blending, "current_target", lambda: target)
+    c = case(1, 20, 21, 17, channels=4, device=DEVICE)
+    want = reference.blend_blocks(*(x.cpu() if isinstance(x, Tensor) else x for x in c.arguments))
+    assert_close([g.cpu() for g in blending.blend(*c.arguments)], want, 1e-12)
 
 
 @pytest.mark.parametrize("channels", [3, 6])

@@ -1,4 +1,4 @@
-"""The command line: `tsplat fit`, `tsplat render`, `tsplat convert`, `tsplat info`."""
+"""The command line: `tsplat fit`, `tsplat eval`, `tsplat render`, `tsplat convert`, `tsplat info`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,9 @@ from torch import Tensor
 
 import tsplat
 from tsplat.camera import Camera
-from tsplat.fit import FitConfig, draw, fit
+from tsplat.fit import FitConfig, Quality, draw, evaluate, fit
+from tsplat.fit.evaluation import mean_quality
+from tsplat.fit.output import metrics_of, read_config, write_json
 from tsplat.scene import Gaussians, load_capture, write_image, write_synthetic_capture
 from tsplat.scene.formats import FORMATS, find_format, is_sog
 
@@ -66,6 +68,7 @@ def _parser() -> argparse.ArgumentParser:
     shared = argparse.ArgumentParser(add_help=False)
     shared.add_argument("--debug", action="store_true", help="show where an error came from (also: TSPLAT_DEBUG=1)")
     _add_fit(commands.add_parser("fit", parents=[shared], help="fit a scene to photos"))
+    _add_eval(commands.add_parser("eval", parents=[shared], help="measure a scene file against held-out photos"))
     _add_render(commands.add_parser("render", parents=[shared], help="render a scene to PNG"))
     _add_convert(commands.add_parser("convert", parents=[shared], help="write a scene in another file format"))
     _add_info(commands.add_parser("info", parents=[shared], help="say what is in a scene file or a folder of photos"))
@@ -74,26 +77,49 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_fit(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_fit)
-    parser.description = ("Fit Gaussians to posed photos. Writes scene.ply, metrics.json, test/*.png (held-out photo beside "
-                          "render) and checkpoint.pt, from which the same command goes on after an interruption.")
+    parser.description = ("Fit Gaussians to posed photos. Writes scene.ply, metrics.json, config.json, curves.png, test/*.png (held-out "
+                          "photo beside render), contact.png and checkpoint.pt, from which the same command goes on after an interruption.")
     data = parser.add_mutually_exclusive_group(required=True)
     data.add_argument("data", nargs="?", metavar="DATA", help="folder of a COLMAP model with photos, or of a transforms.json")
     data.add_argument("--synthetic", action="store_true",
                       help="no photos at hand: render a small capture of a made-up scene to OUT/capture, and fit that")
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT", help="folder to write to, made if need be")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="a config.json, for what is not given here: makes the same scene again")
     parser.add_argument("--fresh", action="store_true", help="start anew instead of going on from OUT/checkpoint.pt")
     parser.add_argument("--quiet", action="store_true", help="no progress line")
     _add_device(parser)
+    _add_fields(parser, [item.name for item in dataclasses.fields(FitConfig)])
+
+
+def _add_fields(parser: argparse.ArgumentParser, names: Sequence[str]) -> None:
+    """An option for each of these fields of `FitConfig`, which is not in the result if it was not given."""
     kinds = typing.get_type_hints(FitConfig)
     for item in dataclasses.fields(FitConfig):
-        kind, text = kinds[item.name], f"{item.metadata['help']} (default: {item.default})"
+        if item.name not in names:
+            continue
+        kind, text = kinds[item.name], item.metadata["help"]
+        if item.default is None:                                                     # `kind | None`, of which the help says what None means
+            kind = next(k for k in typing.get_args(kind) if k is not type(None))
+        else:
+            text = f"{text} (default: {item.default:g})" if kind is float else f"{text} (default: {item.default})"
         flag = "--" + item.name.replace("_", "-")
         if kind is bool:
-            parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=item.default, help=item.metadata["help"])
+            parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=argparse.SUPPRESS, help=text)
         elif choices := typing.get_args(kind):
-            parser.add_argument(flag, choices=choices, default=item.default, help=text)
+            parser.add_argument(flag, choices=choices, default=argparse.SUPPRESS, help=text)
         else:
-            parser.add_argument(flag, type=kind, default=item.default, metavar=kind.__name__.upper(), help=text)
+            parser.add_argument(flag, type=kind, default=argparse.SUPPRESS, metavar=kind.__name__.upper(), help=text)
+
+
+def _add_eval(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(run=_eval)
+    parser.description = ("Measure a scene against the held-out photos of a capture. What is not given here is taken from the config.json "
+                          "beside the scene, if there is one: then the result is what metrics.json says.")
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="a scene file (.ply)")
+    parser.add_argument("data", metavar="DATA", help="the capture: folder or transforms.json")
+    parser.add_argument("-o", "--out", type=Path, metavar="OUT.json", help="also write the metrics of each photo to this file")
+    _add_device(parser)
+    _add_fields(parser, ("downscale", "test_every", "background", "antialiased"))
 
 
 def _add_render(parser: argparse.ArgumentParser) -> None:
@@ -129,7 +155,7 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
 
 
 def _fit(options: argparse.Namespace) -> None:
-    config = FitConfig(**{item.name: getattr(options, item.name) for item in dataclasses.fields(FitConfig)})
+    config = _config(options, options.config)
     data = options.data
     if options.synthetic:
         data = options.out / "capture"
@@ -137,9 +163,37 @@ def _fit(options: argparse.Namespace) -> None:
             print(f"rendering a small capture of a made-up scene to {data}")
             write_synthetic_capture(data)
     result = fit(data, config, options.out, resume=not options.fresh, progress=not options.quiet, device=_device(options.device))
-    if result.mean is not None:
-        print(f"{len(result.qualities)} held-out photos: PSNR {result.mean.psnr:.2f} dB, SSIM {result.mean.ssim:.4f}")
+    _print_mean(result.qualities)
+    if result.refined_mean is not None:
+        print(f"with their poses refined, too: PSNR {result.refined_mean.psnr:.2f} dB, SSIM {result.refined_mean.ssim:.4f}")
     print(f"{len(result.gaussians)} splats after {config.steps} steps in {result.seconds:.0f} s: {options.out / 'scene.ply'}")
+
+
+def _config(options: argparse.Namespace, path: Path | None) -> FitConfig:
+    """What the options say, on top of what the file says."""
+    given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FitConfig) if hasattr(options, item.name)}
+    return FitConfig(**given) if path is None else dataclasses.replace(read_config(path), **given)
+
+
+def _eval(options: argparse.Namespace) -> None:
+    beside = options.scene.with_name("config.json")
+    config = _config(options, beside if beside.is_file() else None)
+    gaussians = Gaussians.load(options.scene).to(_device(options.device))
+    capture = load_capture(options.data, downscale=config.downscale, test_every=config.test_every)
+    if not capture.test:
+        raise ValueError(f"{options.data}: expected held-out photos; there are none with test_every = {config.test_every}")
+    qualities = evaluate(gaussians, capture, capture.test, config)
+    for name, quality in qualities.items():
+        print(f"{name}: PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}")
+    _print_mean(qualities)
+    if options.out is not None:
+        write_json(options.out, metrics_of(qualities))
+
+
+def _print_mean(qualities: dict[str, Quality]) -> None:
+    mean = mean_quality(qualities)
+    if mean is not None:
+        print(f"{len(qualities)} held-out photos: PSNR {mean.psnr:.2f} dB, SSIM {mean.ssim:.4f}")
 
 
 def _render(options: argparse.Namespace) -> None:

@@ -20,6 +20,7 @@ class Target:
 
     lanes: int      # threads of a warp (64 on CDNA)
     ptx: bool       # whether NVIDIA's inline assembly is understood
+    predicates: bool = False    # whether the compiler makes a predicated instruction of a sum and a select
 
     @property
     def family(self) -> str:
@@ -43,7 +44,8 @@ def current_target() -> Target:
 def _target(driver: Any, device: Any) -> Target:
     """Held, as to ask for a device's properties takes 5 us, and is done some ten times in a forward and backward."""
     target = driver.get_current_target()
-    return Target(target.warp_size, target.backend == "cuda")
+    nvidia = target.backend == "cuda"
+    return Target(target.warp_size, nvidia, nvidia and target.arch == 90)
 
 
 class Launcher:
@@ -104,7 +106,8 @@ def _splats(block: int, num_warps: int) -> dict[str, int]:
 
 # project, harmonics: a splat per thread, so that no thread repeats another's work. As few warps as can be where there are sums over the block:
 # one needs no step from warp to warp, and sums of more blocks to add up are a percent or two of what is read anyway. (project_backward in two
-# warps spills on sm_120.) pick: a count of BLOCK must fit a byte. blend: a warp takes 4 tiles (8 of 64 lanes). features: splats and channels
+# warps spills on sm_120.) pick: a count of BLOCK must fit a byte. blend: a warp takes 4 tiles (8 of 64 lanes). adam: BLOCK numbers of a
+# program, in whole rows: 8 a thread, in 16-byte loads. features: splats and channels
 # of a matrix product; in 4 warps the forward was faster on an H100, but spills on sm_120. All columns but NVIDIA's are untimed.
 LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "project": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
@@ -116,11 +119,22 @@ LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "records": {"nvidia": _splats(32, 1), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
     "blend": {family: {"num_warps": 1} for family in FAMILIES},
     "blend_backward": {family: {"num_warps": 1} for family in FAMILIES},
+    "adam": {"nvidia": _splats(1024, 4), "cdna": _splats(1024, 4), "rdna": _splats(1024, 4)},
     "features": {"nvidia": {"K": 16, "DB": 64, "num_warps": 8}, "cdna": {"K": 16, "DB": 32, "num_warps": 8},
                  "rdna": {"K": 16, "DB": 32, "num_warps": 8}},
     "features_colors_backward": {"nvidia": {"K": 16, "DB": 32, "num_warps": 4}, "cdna": {"K": 16, "DB": 32, "num_warps": 4},
                                  "rdna": {"K": 16, "DB": 16, "num_warps": 8}},
     "features_backward": {family: {"K": 16, "DB": 32, "num_warps": 4} for family in FAMILIES},
+    "outlines": {family: _splats(128, 4) for family in FAMILIES},
+    "blend_spheres": {family: {"num_warps": 1} for family in FAMILIES},
+    "blend_spheres_backward": {family: {"num_warps": 1} for family in FAMILIES},
+    "nearest_hits": {family: {"num_warps": 1} for family in FAMILIES},
+    "sphere_features": {"nvidia": {"K": 16, "DB": 64, "num_warps": 8}, "cdna": {"K": 16, "DB": 32, "num_warps": 8},
+                        "rdna": {"K": 16, "DB": 32, "num_warps": 8}},
+    "sphere_features_backward": {"nvidia": {"K": 16, "DB": 32, "num_warps": 4}, "cdna": {"K": 16, "DB": 32, "num_warps": 4},
+                                 "rdna": {"K": 16, "DB": 16, "num_warps": 8}},
+    "sphere_feature_backward": {family: {"K": 16, "DB": 32, "num_warps": 4} for family in FAMILIES},
+    "upstream": {family: {"DB": 4, **_splats(128, 4)} for family in FAMILIES},
 }
 
 

@@ -178,10 +178,10 @@ def test_names(tmp_path: Path) -> None:
     assert [find_format(tmp_path / name).name for name in ("a.ply", "c.ply", "x.SPZ", "x/meta.json")] == [
         "3DGS .ply", "PlayCanvas compressed .ply", "SPZ", "SOG"]
     assert Gaussians.load(tmp_path / "c.ply").sh_degree == 1
-    for name in ("a.sog", "a.ksplat", "meta.json"):
+    for name in ("a.sog", "a.ksplat", "a.obj", "meta.json"):
         with pytest.raises(ValueError, match=r"ends in \.ply, \.compressed\.ply, \.splat, \.spz or \.glb; got"):
             gaussians.save(tmp_path / name)
-    assert [item.suffix for item in FORMATS if item.write is None] == [".sog"]
+    assert [item.suffix for item in FORMATS if item.write is None] == [".sog", ".ksplat"]
 
 
 @pytest.mark.parametrize("degree", range(5))
@@ -314,7 +314,8 @@ def test_rewritten_files_look_the_same(playbot: Gaussians, tmp_path: Path, write
 def test_small_fixtures(data_root: Path) -> None:
     """Four splats at the corners of a square, written by other programs; those of .spz have y up and look back."""
     folder = data_root / "splats" / "fixtures"
-    loaded = {name: Gaussians.load(folder / name) for name in ("minimal-raw.spz", "minimal-v2.spz", "minimal-v3.spz", "minimal.splat")}
+    loaded = {name: Gaussians.load(folder / name) for name in ("minimal-raw.spz", "minimal-v2.spz", "minimal-v3.spz", "minimal.splat",
+                                                         "minimal.ksplat")}
     for name, gaussians in loaded.items():
         back = 1.0 if name in ("minimal-raw.spz", "minimal-v2.spz") else -1.0
         assert gaussians.means.tolist() == [[-1, 0, back], [0, 0, back], [-1, 0, 0], [0, 0, 0]], name
@@ -322,6 +323,8 @@ def test_small_fixtures(data_root: Path) -> None:
         assert float((gaussians.log_scales - math.log(0.1)).abs().max()) <= 1 / 32
         assert float(draw(gaussians).std()) > 0.01
     assert differences(loaded["minimal-raw.spz"], loaded["minimal-v2.spz"]) == dict.fromkeys(differences(*[loaded["minimal.splat"]] * 2), 0.0)
+    assert torch.equal(loaded["minimal.ksplat"].sh0, loaded["minimal.splat"].sh0)
+    assert torch.equal(loaded["minimal.ksplat"].opacity_logits, loaded["minimal.splat"].opacity_logits)
     assert differences(loaded["minimal-v3.spz"], loaded["minimal.splat"])["sh0"] <= STEP / 0.15 + STEP / SH_C0 + ROUNDING
 
 

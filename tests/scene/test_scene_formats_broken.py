@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 
 from bench.fuzz_readers import Sample, check, ksplat, mutated, samples, scene, sog, webp, zipped
 from tsplat.scene import Gaussians
+from tsplat.scene.formats import is_sog
 from tsplat.scene.gaussians import SH_C0
 from tsplat.scene.ply_table import read_header
 
@@ -86,13 +87,13 @@ def test_foreign_files(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", ["a.spz", "a.splat", "a.glb", "a.compressed.ply"])
 def test_full_disk_leaves_the_old_file(tmp_path: Path, name: str) -> None:
     resource = pytest.importorskip("resource", reason="needs POSIX file size limits")
-    scene(3).save(tmp_path / name)
+    scene(3, degree=0).save(tmp_path / name)
     before = (tmp_path / name).read_bytes()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2048, limits[1]))
     try:
         with pytest.raises(OSError, match=r"large|space"):
-            scene(2000).save(tmp_path / name)
+            scene(2000, degree=0).save(tmp_path / name)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert (tmp_path / name).read_bytes() == before
@@ -346,6 +347,9 @@ def test_sog_folder(tmp_path: Path) -> None:
         (tmp_path / name).write_bytes(data)
     loaded = Gaussians.load(tmp_path)
     assert (len(loaded), loaded.sh_degree) == (6, 2)
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "capture" / "meta.json").write_text("{}")
+    assert [is_sog(tmp_path), is_sog(tmp_path / "capture")] == [True, False]
     (tmp_path / "quats.webp").unlink()
     with pytest.raises(FileNotFoundError, match=r"quats\.webp"):
         Gaussians.load(tmp_path / "meta.json")

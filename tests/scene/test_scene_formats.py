@@ -352,7 +352,7 @@ def test_glb_fixture(data_root: Path) -> None:
     opacities = torch.full((15,), 0.25)
     opacities[8:11] = torch.tensor([0.75, 64 / 255, 16384 / 65535])
     torch.testing.assert_close(gaussians.opacities.detach(), opacities)
-    assert float(gaussians.sh0[3, 0, 2]) == pytest.approx(0.3)
+    assert gaussians.sh0[3, 0, 2].item() == pytest.approx(0.3)
     signs = torch.tensor([-1.0, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1, 1, -1])      # of x and y: those of odd order
     file = data_root / "splats" / "fixtures" / "khr_conformance_matrix.glb"
     data = file.read_bytes()

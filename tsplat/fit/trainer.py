@@ -167,7 +167,7 @@ def train_step(state: FitState, capture: Capture, config: FitConfig, images: Pho
 
 def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStream | None) -> Step:
     scene, primitive, extent = state.gaussians, primitive_of(config), capture.extent
-    device = scene.means.device
+    device = scene.device
     view = state.next_view(capture.train)
     photo = (images or capture.images)[view].to(device)
     if images is not None and state.queue:

@@ -54,3 +54,12 @@ KERNELS = Backend("cuda", torch.device("cuda"), torch.float64) if torch.cuda.is_
     "interpreter", torch.device("cpu"), torch.float64)
 """The Triton kernels: on a GPU if there is one, else interpreted."""
 BACKENDS = {b.name: b for b in (Backend("reference", torch.device("cpu"), torch.float64), KERNELS)}
+
+
+@contextlib.contextmanager
+def reference_again() -> Iterator[None]:
+    """CPU tensors run the reference, where they are sent to the interpreted kernels around this, too."""
+    with contextlib.ExitStack() as stack:
+        for op in OPS:
+            stack.enter_context(op.set_kernel_enabled("cpu", True))
+        yield

@@ -14,7 +14,7 @@ import tsplat_reference as reference
 from backends import Backend
 from compare import Peak, assert_close, assert_same_bits, gradients, leaves, strided, threads
 from torch import Tensor
-from tsplat_reference import blending, blocks, footprint
+from tsplat_reference import blending, footprint, walk
 
 from tsplat import ops
 
@@ -122,7 +122,7 @@ def test_lists_longer_than_a_chunk(backend: Backend, count: int, opacity: tuple[
     chunk.
     """
     s = scenes.splats2d(1, count, 10, 9, size=(3.0, 20.0), opacity=opacity)
-    assert lists(s, 10, 9, 8).offsets.diff().max() > 0.8 * count >= 0.8 * blocks.CHUNK
+    assert lists(s, 10, 9, 8).offsets.diff().max() > 0.8 * count >= 0.8 * walk.CHUNK
     assert_all_three_agree(s, 10, 9, 8, backend=backend)
 
 
@@ -141,7 +141,7 @@ def test_chunks_blocks_and_groups_change_nothing(monkeypatch: pytest.MonkeyPatch
 
     want = run()
     for name, value in (("CHUNK", chunk), ("BLOCK", block), ("GROUP", group), ("GROUP_TILES", group_tiles), ("WORTH_WORKERS", 0)):
-        monkeypatch.setattr(blocks, name, value)
+        monkeypatch.setattr(walk, name, value)
     with threads(1):
         got = run()
     assert_close(got[:2], want[:2], 1e-14)
@@ -363,9 +363,9 @@ def test_working_memory_does_not_grow_with_the_pairs_of_pixels_and_splats(monkey
     Measured 14 numbers for each splat and each pixel in the forward, 27 and 13 in the backward.
     """
     by_default = peaks(100, 24)
-    constants = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "GROUP_TILES": 1}
+    constants = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "FEW": 1 << 6, "GROUP_TILES": 1}
     for name, value in constants.items():
-        monkeypatch.setattr(blocks, name, value)
+        monkeypatch.setattr(walk, name, value)
     for n, side in ((100, 24), (400, 24), (100, 48)):  # of which each but the first has four times the pairs
         allowed = 30 * n + 16 * side * side + 5 * constants["BLOCK"] + 100 * constants["GROUP"]
         assert max(peaks(n, side)) < allowed

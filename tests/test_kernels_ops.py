@@ -185,7 +185,7 @@ class Compiler:
         return "stream"
 
     def get_current_target(self) -> Any:
-        return SimpleNamespace(backend="cuda", warp_size=32)
+        return SimpleNamespace(backend="cuda", arch=90, warp_size=32)
 
 
 @pytest.fixture

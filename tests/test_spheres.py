@@ -160,7 +160,7 @@ def test_a_ray_through_a_centre(backend: Backend, distance: str) -> None:
     z = (FAR - 2) / (FAR - NEAR)
     term = 0.8 * math.exp(0.8 * z / 0.1)
     weight = term / (term + math.exp(1e-5))
-    assert abs(float(r.alpha[4, 4]) - weight) < 1e-14
+    assert abs(float(r.alpha[4, 4].detach()) - weight) < 1e-14
     by_logit = weight * (1 - weight) * float((s.features - 1).sum())
     slope = by_logit * 0.8 / 0.1 / (FAR - NEAR)                                             # dL/d(-D)
     assert_close(v_p.cpu(), torch.tensor([[0, 0, -slope]], dtype=torch.float64), 1e-9)
@@ -372,7 +372,7 @@ def peaks(n: int, side: int) -> int:
 def test_working_memory_does_not_grow_with_the_pairs_of_pixels_and_spheres(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some numbers for each sphere, for each pixel and channel, and constants; here with small constants, and every sphere on every pixel."""
     by_default = peaks(100, 24)
-    constants = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "GROUP_TILES": 1}
+    constants = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "FEW": 1 << 6, "GROUP_TILES": 1}
     for name, value in constants.items():
         monkeypatch.setattr(walk, name, value)
     for n, side in ((100, 24), (400, 24), (100, 48)):  # of which each but the first has four times the pairs

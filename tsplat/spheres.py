@@ -37,8 +37,8 @@ class SphereRendering(NamedTuple):
     """Result of `render_spheres`, with a leading dimension C where the camera is a batch.
 
     image: `[(C,) H, W, D]`. alpha: `[(C,) H, W]`, 1 minus the background's weight. depth: `[(C,) H, W]` or None. hits: or None.
-    visible: bool `[(C,) N]`, which spheres were not culled. needed: int64 `[]`, the capacity that was needed, if one was given: if it is
-    more than that, spheres are missing in the image.
+    visible: bool `[(C,) N]`, which spheres were not culled. logsumexp: `[(C,) H, W]`, log of the denominator of the weights, part of the
+    graph. needed: int64 `[]`, the capacity that was needed, if one was given: if it is more than that, spheres are missing in the image.
     """
 
     image: Tensor
@@ -46,6 +46,7 @@ class SphereRendering(NamedTuple):
     depth: Tensor | None
     hits: Hits | None
     visible: Tensor
+    logsumexp: Tensor
     needed: Tensor | None
 
 
@@ -111,10 +112,10 @@ def render_spheres(positions: Tensor, features: Tensor, radii: Tensor, camera: C
     ids = cutoff = None
     if n_track:
         ids = ops.nearest_hits(centers, R, Ks, *bins, n_track + tracked_only, width, height, tile, model, near, far, chord)
-        if tracked_only:                                # between the last hit that is tracked and the first that is not
+        if tracked_only:                                # half way to the next hit: D of a grazing ray, computed twice, is not quite the same
             last, _ = hit_weights(centers.detach(), R.detach(), o.detach(), g.detach(), Ks.detach(), centers.new_zeros(C, height, width),
                                   ids[..., -2:], model, near, far, chord)
-            cutoff, ids = last.mean(-1), ids[..., :-1]
+            cutoff, ids = last.mean(-1), ids[..., :-1].contiguous()
     images = ops.blend_spheres(centers, R, o, f, backgrounds, g, Ks, *bins, cutoff, width, height, tile, model, near, far, background_depth,
                                chord, depth is not None, percent_allowed_difference)
     alpha = -torch.expm1(background_depth / g - images.logsumexp)
@@ -126,9 +127,9 @@ def render_spheres(positions: Tensor, features: Tensor, radii: Tensor, camera: C
         hits = Hits(ids, *hit_weights(centers, R, o, g, Ks, images.logsumexp, ids, model, near, far, chord))
     seen = visible[..., 0] > 0
     if camera.batched:
-        return SphereRendering(images.image, alpha, z, hits, seen, needed)
+        return SphereRendering(images.image, alpha, z, hits, seen, images.logsumexp, needed)
     return SphereRendering(images.image.squeeze(0), alpha.squeeze(0), None if z is None else z.squeeze(0),
-                           None if hits is None else Hits(*(h.squeeze(0) for h in hits)), seen.squeeze(0), needed)
+                           None if hits is None else Hits(*(h.squeeze(0) for h in hits)), seen.squeeze(0), images.logsumexp.squeeze(0), needed)
 
 
 def _to_camera(positions: Tensor, viewmats: Tensor) -> Tensor:

@@ -108,3 +108,24 @@ def splats2d(cameras: int, n: int, width: int, height: int, *, seed: int = 0, ch
                     uniform(0.0, 1.0, 1 if shared_colors else cameras, n, channels, seed=g),
                     uniform(0.0, 1.0, cameras, channels, seed=g) if background else None, uniform(1.0, 9.0, cameras, n, seed=g),
                     radii)
+
+
+class Spheres(NamedTuple):
+    """The arguments of `tsplat.render_spheres` but the camera."""
+
+    positions: Tensor
+    features: Tensor
+    radii: Tensor
+    opacities: Tensor
+
+
+def spheres(n: int, *, cameras: int | None = None, seed: int = 0, channels: int = 3, depth: tuple[float, float] = (2.0, 6.0), spread: float = 0.8,
+            size: tuple[float, float] = (0.05, 0.6), opacity: tuple[float, float] = (0.05, 1.0)) -> Spheres:
+    """n spheres in front of a camera at the origin that looks along z, some of them partly or wholly out of its view; with
+    `cameras`, others for each."""
+    g = generator(seed)
+    shape = (n,) if cameras is None else (cameras, n)
+    z = uniform(*depth, *shape, seed=g)
+    xy = uniform(-spread, spread, *shape, 2, seed=g) * z[..., None]
+    radii = uniform(math.log(size[0]), math.log(size[1]), *shape, seed=g).exp()
+    return Spheres(torch.cat([xy, z[..., None]], -1), uniform(0.0, 1.0, *shape, channels, seed=g), radii, uniform(*opacity, *shape, seed=g))

@@ -12,12 +12,9 @@ import scenes
 import torch
 import tsplat_reference as reference
 from backends import Backend
-from compare import assert_close, assert_same_bits, gradients, leaves, strided, threads
+from compare import Peak, assert_close, assert_same_bits, gradients, leaves, strided, threads
 from torch import Tensor
-from torch.multiprocessing.reductions import StorageWeakRef
-from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_leaves
-from tsplat_reference import blending, blocks, footprint
+from tsplat_reference import blending, footprint, walk
 
 from tsplat import ops
 
@@ -125,7 +122,7 @@ def test_lists_longer_than_a_chunk(backend: Backend, count: int, opacity: tuple[
     chunk.
     """
     s = scenes.splats2d(1, count, 10, 9, size=(3.0, 20.0), opacity=opacity)
-    assert lists(s, 10, 9, 8).offsets.diff().max() > 0.8 * count >= 0.8 * blocks.CHUNK
+    assert lists(s, 10, 9, 8).offsets.diff().max() > 0.8 * count >= 0.8 * walk.CHUNK
     assert_all_three_agree(s, 10, 9, 8, backend=backend)
 
 
@@ -143,12 +140,12 @@ def test_chunks_blocks_and_groups_change_nothing(monkeypatch: pytest.MonkeyPatch
         return [*outputs, *gradients(outputs, [*inputs, probe])]
 
     want = run()
-    for name, value in (("CHUNK", chunk), ("BLOCK", block), ("GROUP", group), ("GROUP_TILES", group_tiles)):
-        monkeypatch.setattr(blocks, name, value)
-    got = run()
+    for name, value in (("CHUNK", chunk), ("BLOCK", block), ("GROUP", group), ("GROUP_TILES", group_tiles), ("WORTH_WORKERS", 0)):
+        monkeypatch.setattr(walk, name, value)
+    with threads(1):
+        got = run()
     assert_close(got[:2], want[:2], 1e-14)
     assert_close(got[2:], want[2:], 1e-12)
-    monkeypatch.setattr(blocks, "WORTH_WORKERS", 0)
     with threads(2):
         assert_same_bits(run(), got)
 
@@ -345,26 +342,6 @@ def test_float32_stays_within_its_rounding_errors(tile: int) -> None:
     assert_close(v32, v64, 2 * error)
 
 
-class Peak(TorchDispatchMode):
-    """The most bytes of tensors, made while it is active, that were alive at the same time."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.alive: dict[int, tuple[StorageWeakRef, int]] = {}
-        self.peak = 0
-
-    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-        """Run the function and count."""
-        result = function(*args, **(kwargs or {}))
-        for tensor in tree_leaves(result):
-            if isinstance(tensor, Tensor):
-                storage = tensor.untyped_storage()
-                self.alive[storage._cdata] = StorageWeakRef(storage), storage.nbytes()
-        self.alive = {k: v for k, v in self.alive.items() if not v[0].expired()}
-        self.peak = max(self.peak, sum(size for _, size in self.alive.values()))
-        return result
-
-
 def peaks(n: int, side: int) -> tuple[int, int]:
     """Peaks of forward and backward in numbers of 8 bytes, without the inputs, which are made before; on one thread."""
     s = scenes.splats2d(1, n, side, side, size=(20.0, 200.0), opacity=(0.01, 0.05))
@@ -386,9 +363,9 @@ def test_working_memory_does_not_grow_with_the_pairs_of_pixels_and_splats(monkey
     Measured 14 numbers for each splat and each pixel in the forward, 27 and 13 in the backward.
     """
     by_default = peaks(100, 24)
-    constants = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "GROUP_TILES": 1}
+    constants = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "FEW": 1 << 6, "GROUP_TILES": 1}
     for name, value in constants.items():
-        monkeypatch.setattr(blocks, name, value)
+        monkeypatch.setattr(walk, name, value)
     for n, side in ((100, 24), (400, 24), (100, 48)):  # of which each but the first has four times the pairs
         allowed = 30 * n + 16 * side * side + 5 * constants["BLOCK"] + 100 * constants["GROUP"]
         assert max(peaks(n, side)) < allowed

@@ -93,6 +93,16 @@ def test_forward_and_backward_agree_with_the_reference(name: str) -> None:
     assert_close([g.cpu() for g in v_got], v_want, 1e-12)
 
 
+@pytest.mark.parametrize("predicates", [False, True])
+def test_splats_that_are_not_shown_are_left_out_either_way(monkeypatch: pytest.MonkeyPatch, predicates: bool) -> None:
+    """By a weight of 0, or by a predicate of the sums: one for some targets, one for the others."""
+    target = dataclasses.replace(blending.current_target(), predicates=predicates)
+    monkeypatch.setattr(blending, "current_target", lambda: target)
+    c = case(1, 20, 21, 17, channels=4, device=DEVICE)
+    want = reference.blend_blocks(*(x.cpu() if isinstance(x, Tensor) else x for x in c.arguments))
+    assert_close([g.cpu() for g in blending.blend(*c.arguments)], want, 1e-12)
+
+
 @pytest.mark.parametrize("channels", [3, 6])
 def test_deterministic_mode_gives_the_same_gradients_and_the_same_bits(deterministic: None, channels: int) -> None:
     c = case(1, 15, 30, 18, channels=channels, device=DEVICE)

@@ -30,8 +30,8 @@ from tsplat import Camera, ops
 WITHOUT_INTERPRETER = True           # ten minutes there: test_kernels_ops.py takes a selection
 WIDTH, HEIGHT, TILE = 7, 6, 4 if not torch.cuda.is_available() else 8
 # the package has functions of these names
-projection, harmonics, binning, blending = (importlib.import_module(f"tsplat.ops.{name}")
-                                            for name in ("projection", "harmonics", "binning", "blending"))
+projection, harmonics, binning, blending, spheres = (importlib.import_module(f"tsplat.ops.{name}") for name in (
+    "projection", "harmonics", "binning", "blending", "spheres"))
 
 
 def project_arguments(antialiased: bool = True, covars: bool = False, n: int = 6) -> tuple[Any, ...]:
@@ -85,6 +85,37 @@ def blend_backward_arguments(n: int = 6, background: bool = True, absgrad: bool 
     return (*args[:5], *args[6:8], image, alphas, torch.randn_like(image), torch.randn_like(alphas), *args[8:], absgrad)
 
 
+def outline_arguments(n: int = 6, model: str = "pinhole") -> tuple[Any, ...]:
+    s, cam = scenes.spheres(n, seed=1, spread=0.4), scenes.camera(2, WIDTH, HEIGHT, model=model)
+    centers = torch.einsum("cij,nj->cni", cam.viewmats[:, :3, :3], s.positions) + cam.viewmats[:, None, :3, 3]
+    return centers, s.radii[None], cam.Ks, WIDTH, HEIGHT, model, 0.5, 8.0
+
+
+def sphere_bins(*args: Any) -> tuple[Tensor, Tensor]:
+    o = reference.outlines(*args)
+    return reference.bin_splats(o.means2d, o.radii, o.conics, o.opacities, o.depths, WIDTH, HEIGHT, TILE)
+
+
+def nearest_arguments(n: int = 6) -> tuple[Any, ...]:
+    centers, radii, Ks, *options = outline_arguments(n)
+    return centers, radii, Ks, *sphere_bins(centers, radii, Ks, *options), 3, WIDTH, HEIGHT, TILE, "pinhole", 0.5, 8.0, False
+
+
+def sphere_arguments(n: int = 6, model: str = "pinhole", chord: bool = False, depth: bool = True, cut: bool = False) -> tuple[Any, ...]:
+    centers, radii, Ks, *_ = args = outline_arguments(n, model)
+    s = scenes.spheres(n, seed=1)
+    return (centers, radii, s.opacities[None], s.features[None], torch.rand(2, 3, dtype=torch.float64),
+            torch.tensor(0.2, dtype=torch.float64), Ks, *sphere_bins(*args),
+            torch.full((2, HEIGHT, WIDTH), 4.0, dtype=torch.float64) if cut else None, WIDTH, HEIGHT, TILE, model, 0.5, 8.0, 0.1, chord, depth, 0.0)
+
+
+def sphere_backward_arguments(intrinsics: bool = True, depth: bool = True, **others: Any) -> tuple[Any, ...]:
+    args = sphere_arguments(depth=depth, **others)
+    images = reference.blend_spheres(*args[:-1])
+    v_image, v_depth, v_logsumexp = (torch.randn_like(x) for x in images[:3])
+    return *args[:10], *images, v_image, v_depth if depth else None, v_logsumexp if depth else None, *args[10:18], intrinsics
+
+
 CASES: dict[str, tuple[Any, Callable[..., tuple[Any, ...]], dict[str, Any]]] = {
     "project": (projection.project_op, project_arguments, {}),
     "project, covars": (projection.project_op, project_arguments, {"covars": True, "antialiased": False}),
@@ -114,6 +145,18 @@ CASES: dict[str, tuple[Any, Callable[..., tuple[Any, ...]], dict[str, Any]]] = {
     "blend_backward, bare": (blending.blend_backward_op, blend_backward_arguments,
                              {"background": False, "absgrad": False, "shared_colors": True}),
     "blend_backward, N = 0": (blending.blend_backward_op, blend_backward_arguments, {"n": 0}),
+    "outlines": (spheres.outlines_op, outline_arguments, {}),
+    "outlines, N = 0": (spheres.outlines_op, outline_arguments, {"n": 0}),
+    "nearest_hits": (spheres.nearest_hits_op, nearest_arguments, {}),
+    "nearest_hits, N = 0": (spheres.nearest_hits_op, nearest_arguments, {"n": 0}),
+    "blend_spheres": (spheres.blend_spheres_op, sphere_arguments, {}),
+    "blend_spheres, orthographic": (spheres.blend_spheres_op, sphere_arguments, {"model": "orthographic", "depth": False}),
+    "blend_spheres, chord": (spheres.blend_spheres_op, sphere_arguments, {"chord": True}),
+    "blend_spheres, N = 0": (spheres.blend_spheres_op, sphere_arguments, {"n": 0}),
+    "blend_spheres_backward": (spheres.blend_spheres_backward_op, sphere_backward_arguments, {}),
+    "blend_spheres_backward, bare": (spheres.blend_spheres_backward_op, sphere_backward_arguments, {"depth": False, "intrinsics": False}),
+    "blend_spheres_backward, cut": (spheres.blend_spheres_backward_op, sphere_backward_arguments, {"cut": True}),
+    "blend_spheres_backward, N = 0": (spheres.blend_spheres_backward_op, sphere_backward_arguments, {"n": 0}),
 }
 FORWARD = [name for name in CASES if "backward" not in name]
 
@@ -206,7 +249,7 @@ def differentiable_case(name: str, backend: Backend) -> tuple[Callable[..., Any]
     _, make, options = CASES[name]
     args = backend.put(make(**({"n": 3} | options)))
     stage = name.split(",")[0]
-    which = {"project": (0, 1, 2, 3, 5, 6), "harmonics": (0, 1, 2), "blend": (0, 1, 2, 3, 4)}[stage]
+    which = {"project": (0, 1, 2, 3, 5, 6), "harmonics": (0, 1, 2), "blend": (0, 1, 2, 3, 4), "blend_spheres": range(7)}[stage]
     which = [i for i in which if args[i] is not None]
     inputs = leaves(*(args[i] for i in which))
     function = getattr(ops, stage)
@@ -221,7 +264,8 @@ def differentiable_case(name: str, backend: Backend) -> tuple[Callable[..., Any]
     return call, inputs
 
 
-DIFFERENTIABLE = [name for name in FORWARD if not name.startswith("bin") and "N = 0" not in name]
+WITH_GRADIENT = [name for name in FORWARD if not name.startswith(("bin", "outlines", "nearest"))]
+DIFFERENTIABLE = [name for name in WITH_GRADIENT if "N = 0" not in name]
 
 
 @pytest.mark.parametrize("name", DIFFERENTIABLE)
@@ -236,7 +280,7 @@ def test_second_derivatives_are_finite_differences(backend: Backend, name: str) 
     assert gradgradcheck(call, inputs, fast_mode=True)
 
 
-@pytest.mark.parametrize("name", [n for n in FORWARD if not n.startswith("bin")])
+@pytest.mark.parametrize("name", WITH_GRADIENT)
 def test_expanded_upstream_gradients(backend: Backend, name: str) -> None:
     """That of a sum has stride 0 everywhere; gradcheck never makes one."""
     call, inputs = differentiable_case(name, backend)
@@ -346,7 +390,7 @@ def test_fixed_cameras_change_no_other_gradient(backend: Backend) -> None:
 EVERY_OP = list({id(op): op for op, _, _ in CASES.values()}.values())
 
 
-@pytest.mark.parametrize("name", [name for name in CASES if not name.startswith("bin")])
+@pytest.mark.parametrize("name", [name for name in CASES if not name.startswith(("bin", "outlines", "nearest"))])
 def test_both_forms_agree(backend: Backend, name: str) -> None:
     """In results, gradients and, from the forward ops, second derivatives."""
     op, args = case(name, backend)
@@ -522,7 +566,7 @@ def test_ops_compute_in_float32_under_autocast(backend: Backend, name: str) -> N
     with torch.autocast(backend.device.type, torch.bfloat16):
         got = op(*half)
     got, want = ([x] if isinstance(x, Tensor) else x for x in (got, op(*full)))
-    assert torch.float32 in {x.dtype for x in got} or name.startswith("bin_splats")
+    assert torch.float32 in {x.dtype for x in got} or name.startswith(("bin_splats", "nearest_hits"))
     assert_same_bits(got, want)
 
 

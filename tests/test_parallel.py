@@ -43,7 +43,7 @@ def many_pieces(monkeypatch: pytest.MonkeyPatch) -> set[str]:
         return call(function, item)
 
     monkeypatch.setattr(parallel, "_call", named)
-    small = {"blocks.GROUP_TILES": 8, "blocks.WORTH_WORKERS": 0, "projection.CHUNK": 64, "harmonics.CHUNK": 64}
+    small = {"walk.GROUP_TILES": 8, "walk.WORTH_WORKERS": 0, "projection.CHUNK": 64, "harmonics.CHUNK": 64}
     for name, value in small.items():
         module, constant = name.split(".")
         monkeypatch.setattr(importlib.import_module(f"tsplat_reference.{module}"), constant, value)

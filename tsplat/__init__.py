@@ -5,6 +5,7 @@ from tsplat.rasterize import Meta as Meta
 from tsplat.rasterize import Rendering as Rendering
 from tsplat.rasterize import rasterize as rasterize
 from tsplat.scene import Gaussians as Gaussians
+from tsplat.scene import Spheres as Spheres
 from tsplat.scene import load_capture as load_capture
 from tsplat.spheres import Hits as Hits
 from tsplat.spheres import SphereRendering as SphereRendering

@@ -104,7 +104,7 @@ def render_spheres(positions: Tensor, features: Tensor, radii: Tensor, camera: C
         p, R = _scale_gradient(p.expand(C, -1, 3), keep[..., None]), _scale_gradient(R.expand(C, -1), keep)
     centers = _to_camera(p, viewmats)
     outline = ops.outlines(centers, R, Ks, width, height, model, near, far)
-    finite = (torch.linalg.vector_norm(f.detach(), torch.inf, -1) < torch.inf) & (o.detach() >= 0) & (o.detach() < torch.inf)
+    finite = (torch.linalg.vector_norm(f.detach(), 2, -1) < torch.inf) & (o.detach() >= 0) & (o.detach() < torch.inf)
     visible = outline.radii * finite[..., None]
     to_bin = outline.means2d, visible, outline.conics, outline.opacities, outline.depths, width, height, tile
     bins, needed = (ops.bin_splats(*to_bin), None) if capacity is None else ops.bin_splats_fixed(*to_bin, capacity)
@@ -112,10 +112,10 @@ def render_spheres(positions: Tensor, features: Tensor, radii: Tensor, camera: C
     ids = cutoff = None
     if n_track:
         ids = ops.nearest_hits(centers, R, Ks, *bins, n_track + tracked_only, width, height, tile, model, near, far, chord)
-        if tracked_only:                                # half way to the next hit: D of a grazing ray, computed twice, is not quite the same
+        if tracked_only:                                # between the last hit that is tracked and the first that is not
             last, _ = hit_weights(centers.detach(), R.detach(), o.detach(), g.detach(), Ks.detach(), centers.new_zeros(C, height, width),
                                   ids[..., -2:], model, near, far, chord)
-            cutoff, ids = last.mean(-1), ids[..., :-1].contiguous()
+            cutoff, ids = last.mean(-1), ids[..., :-1]
     images = ops.blend_spheres(centers, R, o, f, backgrounds, g, Ks, *bins, cutoff, width, height, tile, model, near, far, background_depth,
                                chord, depth is not None, percent_allowed_difference)
     alpha = -torch.expm1(background_depth / g - images.logsumexp)
@@ -185,7 +185,7 @@ def _check(positions: Tensor, features: Tensor, radii: Tensor, camera: Camera, o
         raise ValueError(f"gamma: expected a number in [1e-5, 1]; got {float(gamma)}")
     for name, number in (("near", near), ("far", far)):
         check_number(name, number, "a distance along the ray")
-    if not (near < far and math.isfinite(far - near)):
+    if not -math.inf < near < far < math.inf:
         raise ValueError(f"near, far: expected near < far, both finite; got {near} and {far}")
     if camera.model == "pinhole" and near < 0:
         raise ValueError(f"near: expected a distance of at least 0 for a pinhole camera; got {near}")

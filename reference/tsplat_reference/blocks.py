@@ -20,87 +20,48 @@ from tsplat_reference import footprint
 from tsplat_reference.binning import tile_counts
 from tsplat_reference.blending import to_image, to_tiles
 from tsplat_reference.constants import ALPHA_MIN, TRANSMITTANCE_MIN
-from tsplat_reference.parallel import workers
+from tsplat_reference.walk import Chunk, Memory, TileLists
 
 R = TypeVar("R")
 
-CHUNK = 64
-"""Splats of a tile per chunk. Finished pixels end with it, so more would waste work; fewer would pay the calls more often."""
-BLOCK = 1 << 18
-"""Pairs in a block: five buffers of this size, 5 MB in float32, are the working set of a thread. Smaller ones fit closer caches, but then
-the calls cost more than that gains (measured from 2^15 to 2^19)."""
-GROUP = 1 << 15
-"""Hits of a group of blocks, whose small operations (gathering, coefficients, scattering) are done together, by one thread: about 60
-numbers per hit, 8 MB in float32. With more than 8 channels a group has fewer hits."""
-GROUP_TILES = 128
-"""Where there are few tiles: no smaller groups than this."""
-WORTH_WORKERS = 1 << 18
-"""Hits from which worker threads gain: at 70k, two threads take 1.1 times as long as one; at 700k, 0.65 times."""
-TINY = 1e-20
-"""Below any transmittance that counts; keeps the divisions by it finite where nothing counts."""
-FAINT = -20.0
-"""Log alpha is clamped to this, far below ALPHA_MIN, as exp takes 15 to 35 times longer where its result underflows."""
+LOG2_ALPHA_MIN = math.log2(ALPHA_MIN)
+"""Alpha is evaluated by exp2, which takes 0.4 times as long as exp, and no longer where the result is 0."""
 
 
 @dataclass(frozen=True)
-class _Lists:
+class _Scene:
     """The splats of all tiles, and what blending needs to know of them."""
 
-    ids: Tensor             # int32 [M]
-    starts: Tensor          # int64 [tiles]
-    counts: Tensor          # int64 [tiles]
-    records: Tensor         # [C N, 6]
+    lists: TileLists
+    records: Tensor         # [6, C N]
     colors: Tensor          # [C N or N, D + 1]; the last channel is 1, for alpha
     shared: int             # N if all cameras share the colours, else 0
     alpha_max: float
     drop_last: bool
-    shape: tuple[int, int, int]     # C, tiles_y, tiles_x
-    tile: int
     monomials: Tensor       # [6, P]
+    exponents: Tensor       # [P, 6]: these times the coefficients of log alpha are log2 alpha
 
     def run(self, function: Callable[[_Group], R], light: Tensor) -> Iterator[R]:
-        """The results of `function` of all that is to do, in an order that the number of threads does not change.
+        """The results of `function` of groups of tiles, in an order that the number of threads does not change.
 
-        `light` `[tiles, P]`, the transmittance, is what `function` updates at the tiles of its group. Groups of tiles go front to back beside
-        each other, each at its own pace: no core waits for the slowest group of a round.
+        `light` `[tiles, P]`, the transmittance, is what `function` updates at the tiles of its group: tiles without any are done.
         """
-        tiles = self.counts.sort(descending=True, stable=True).indices[:int((self.counts > 0).sum())]     # longest lists first
-        size = GROUP * 9 // (CHUNK * max(9, self.colors.shape[1]))
-        size = max(1, min(size, max(GROUP_TILES, -(-len(tiles) // 8))))                     # some groups for each core
-        strands = [map(function, self.chunks(some, light)) for some in torch.split(tiles, size)]
-        with workers(len(self.ids) >= WORTH_WORKERS) as ordered_map:
-            yield from (result for result in ordered_map(_next, strands, repeat=True) if result is not None)
+        return self.lists.run(lambda chunk: function(self.group(chunk)), lambda tiles, begin: _lit(light.index_select(0, tiles)),
+                              self.colors.shape[1])
 
-    def chunks(self, tiles: Tensor, light: Tensor) -> Iterator[_Group]:
-        """The splats of a group of tiles, front to back; tiles that have no more, or no more light, drop out.
-
-        `light` `[tiles, P]`, the transmittance, is read between chunks.
-        """
-        counts = self.counts[tiles]
-        begin = 0
-        while len(tiles):
-            yield self.group(tiles, begin, min(CHUNK, int(counts[0]) - begin))
-            begin += CHUNK
-            live = ((counts > begin) & (light.index_select(0, tiles).amax(1) > TRANSMITTANCE_MIN)).nonzero().squeeze(-1)
-            tiles, counts = tiles.index_select(0, live), counts.index_select(0, live)
-
-    def group(self, tiles: Tensor, begin: int, k: int) -> _Group:
-        """The splats begin..begin + k of the tiles."""
-        at = (self.starts[tiles] + begin)[:, None] + torch.arange(k)                        # [G, K]
-        padding = torch.arange(begin, begin + k) >= self.counts[tiles, None]
-        splats = self.ids.index_select(0, at.clamp_(max=len(self.ids) - 1).flatten()).long()
-        record = self.records.index_select(0, splats).T.contiguous().view(6, *at.shape)    # a row is in one cache line
-        record[5].masked_fill_(padding, footprint.NOTHING)
-        cx = (tiles % self.shape[2] * self.tile).to(record.dtype) + self.tile / 2
-        cy = (tiles // self.shape[2] % self.shape[1] * self.tile).to(record.dtype) + self.tile / 2
-        rows = splats % self.shared if self.shared else splats
+    def group(self, chunk: Chunk) -> _Group:
+        """Records and colours of the splats of a chunk."""
+        record = self.records.index_select(1, chunk.splats).view(6, *chunk.padding.shape)
+        record[5].masked_fill_(chunk.padding, footprint.NOTHING)
+        cx, cy = self.lists.centers(chunk.tiles, record.dtype)
+        rows = chunk.splats % self.shared if self.shared else chunk.splats
         colors = self.colors.index_select(0, rows)
-        return _Group(tiles, splats, rows, record, cx[:, None] - record[0], cy[:, None] - record[1], colors.view(*at.shape, -1),
-                      bool(record[5].amax() >= math.log(self.alpha_max)))
+        return _Group(chunk.tiles, chunk.splats, rows, record, cx[:, None] - record[0], cy[:, None] - record[1],
+                      colors.view(*chunk.padding.shape, -1), bool(record[5].amax() >= math.log(self.alpha_max)))
 
 
 class _Group(NamedTuple):
-    """G tiles with K splats each. (Indices are int64: index_add is 20 times slower with int32.)"""
+    """G tiles with K splats each."""
 
     tiles: Tensor           # [G]
     splats: Tensor          # [G K]
@@ -112,83 +73,69 @@ class _Group(NamedTuple):
     clamps: bool            # whether alpha can reach its clamp
 
 
-def _lists(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ids: Tensor, offsets: Tensor, width: int, height: int,
-           tile: int, alpha_max: float, drop_last: bool) -> _Lists:
+def _scene(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ids: Tensor, offsets: Tensor, width: int, height: int,
+           tile: int, alpha_max: float, drop_last: bool) -> _Scene:
     C, N = opacities.shape
     tiles_x, tiles_y = tile_counts(width, height, tile)
-    records = footprint.records(means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten()).T.contiguous()
+    records = footprint.records(means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten())
     table = torch.nn.functional.pad(colors.reshape(-1, colors.shape[-1]), (0, 1), value=1.0)   # here, not for each hit
-    return _Lists(ids, offsets[:-1], offsets.diff(), records, table, N if len(colors) < C else 0, alpha_max, drop_last,
-                  (C, tiles_y, tiles_x), tile, footprint.monomials(tile, means2d.dtype, means2d.device))
+    monomials = footprint.monomials(tile, means2d.dtype, means2d.device)
+    return _Scene(TileLists(ids, offsets[:-1], offsets.diff(), (C, tiles_y, tiles_x), tile), records, table, N if len(colors) < C else 0,
+                  alpha_max, drop_last, monomials, monomials.T / math.log(2))
 
 
-class _Memory:
-    """Scratch memory for blocks: so many arrays `[B, P, K]`, which the blocks of a group, and then other groups, reuse."""
-
-    def __init__(self, lists: _Lists, buffers: int) -> None:
-        self.pixels, self.channels = lists.tile**2, lists.colors.shape[1]
-        self.shape = buffers, max(BLOCK, self.pixels * CHUNK)
-        self.like = lists.records
-        self.free: list[Tensor] = []
-
-    def blocks(self, group: _Group) -> Iterator[tuple[slice, tuple[Tensor, ...]]]:
-        """Blocks of a group: its rows, and the arrays, contiguous."""
-        memory = self.free.pop() if self.free else self.like.new_empty(self.shape)
-        g, k = group.qx.shape
-        tiles = max(1, BLOCK // (self.pixels * max(k, self.channels)))                      # many channels: they set the working set
-        for i in range(0, g, tiles):
-            b = min(tiles, g - i)
-            yield slice(i, i + b), memory[:, :b * self.pixels * k].view(-1, b, self.pixels, k).unbind(0)
-        self.free.append(memory)
-
-
-def _weights(lists: _Lists, coefficients: Tensor, clamp: bool, light: Tensor, alpha: Tensor, weight: Tensor, T: Tensor) -> None:
-    """Fill in alpha, weight (alpha times the transmittance in front) and T (behind).
+def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, odds: Tensor, weight: Tensor, T: Tensor) -> None:
+    """Fill in odds, alpha/(1 - alpha) or 0 beyond the end of a pixel, weight, which is odds times T, and T, the transmittance behind.
 
     `light` `[B, P]` is the transmittance in front of the chunk, and behind it on return.
     """
-    torch.matmul(lists.monomials.T, coefficients, out=alpha)
-    alpha.clamp_(min=FAINT).exp_()
+    alpha = torch.matmul(scene.exponents, coefficients, out=odds)
+    torch.threshold_(alpha, LOG2_ALPHA_MIN, footprint.NOTHING)
+    alpha.exp2_()
     if clamp:
-        alpha.clamp_(max=lists.alpha_max)
-    torch.threshold_(alpha, ALPHA_MIN, 0.0)
+        alpha.clamp_(max=scene.alpha_max)
     torch.sub(1, alpha, out=weight)
+    torch.div(alpha, weight, out=odds)
     weight[..., 0].mul_(light)
     torch.cumprod(weight, -1, out=T)
-    torch.div(T, weight, out=weight)                        # T in front: cheaper than a shifted copy, and 1 - alpha >= 1 - alpha_max
-    weight[..., 0] = light
-    if lists.drop_last:     # weight where T is above the limit, else 0
-        torch.ops.aten.threshold_backward.grad_input(weight, T, TRANSMITTANCE_MIN, grad_input=weight)
+    if scene.drop_last:
+        _keep_where(T, odds)
     else:
-        torch.threshold_(weight, TRANSMITTANCE_MIN, 0.0)
-    weight.mul_(alpha)
+        _keep_where(T[..., :-1], odds[..., 1:])             # T in front of the others
+        _keep_where(light, odds[..., 0])
+    torch.mul(odds, T, out=weight)
     light.copy_(T[..., -1])
+
+
+def _keep_where(T: Tensor, x: Tensor) -> None:
+    """Set x to 0 where T is at most the limit: a comparison and a mask take several times as long."""
+    torch.ops.aten.threshold_backward.grad_input(x, T, TRANSMITTANCE_MIN, grad_input=x)
 
 
 def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
                  offsets: Tensor, width: int, height: int, tile: int, alpha_max: float, drop_last: bool) -> tuple[Tensor, Tensor]:
     """As `blending.blend`, without autograd. Working memory beyond inputs and outputs: one number per pixel and channel, per splat its record
     and colours, and constants."""
-    lists = _lists(means2d, conics, opacities, colors, ids, offsets, width, height, tile, alpha_max, drop_last)
+    scene = _scene(means2d, conics, opacities, colors, ids, offsets, width, height, tile, alpha_max, drop_last)
     D = colors.shape[-1]
-    light = _light(lists, width, height)
+    light = _light(scene, width, height)
     image = light.new_zeros(len(light), D + 1, tile * tile)
-    memory = _Memory(lists, 3)
+    memory = Memory(scene.records, tile * tile, D + 1, 3)
 
     def blend_group(group: _Group) -> _Group:
         coefficients = footprint.coefficients(group.record, group.qx, group.qy)
         group_light = light.index_select(0, group.tiles)
         group_image = image.new_empty(len(group.tiles), D + 1, tile * tile)
-        for part, (alpha, weight, T) in memory.blocks(group):
-            _weights(lists, coefficients[part], group.clamps, group_light[part], alpha, weight, T)
+        for part, (odds, weight, T) in memory.blocks(*group.qx.shape):
+            _weights(scene, coefficients[part], group.clamps, group_light[part], odds, weight, T)
             torch.bmm(group.colors[part].mT, weight.mT, out=group_image[part])
         light.index_copy_(0, group.tiles, group_light)                                      # no other group has these tiles
         image.index_add_(0, group.tiles, group_image)
         return group
 
-    for _ in lists.run(blend_group, light):
+    for _ in scene.run(blend_group, light):
         pass
-    full = to_image(image, lists.shape, width, height)
+    full = to_image(image, scene.lists.shape, width, height)
     # clones, as an op's results must not share memory, which views of size 1 would
     rendered, alphas = (x.clone(memory_format=torch.contiguous_format) for x in (full[..., :D], full[..., D]))
     if backgrounds is not None:
@@ -203,12 +150,12 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
     (1 - alpha) dL/dimage.)
 
     With L the loss, g_i = <c_i - background, dL/dimage> + dL/dalpha and the rest R_i = sum_{j > i} w_j g_j:
-    dL/dlog alpha_i = w_i g_i - alpha_i/(1 - alpha_i) R_i = w_i (g_i - R_i/T_{i+1}).
+    dL/dlog alpha_i = w_i g_i - alpha_i/(1 - alpha_i) R_i.
     Front to back, R starts as the sum over all splats, which is known from the image, and loses one term at each.
 
     The fifth result is the absolute gradient `[C, N, 2]`: sum over pixels of |dL/dmean2d| per axis (AbsGS); empty unless asked for.
     """
-    lists = _lists(means2d, conics, opacities, colors, ids, offsets, width, height, tile, alpha_max, drop_last)
+    scene = _scene(means2d, conics, opacities, colors, ids, offsets, width, height, tile, alpha_max, drop_last)
     C, N, D = *opacities.shape, colors.shape[-1]
     v_alphas = torch.zeros_like(alphas) if v_alphas is None else v_alphas
     if backgrounds is None:
@@ -217,33 +164,34 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
         behind = torch.einsum("chwd,cd->chw", v_image, backgrounds)                         # <background, dL/dimage>
     upstream = to_tiles(torch.cat([v_image, (v_alphas - behind)[..., None]], -1), tile)     # [tiles, D + 1, P]
     rest = to_tiles(((image * v_image).sum(-1) + alphas * v_alphas - behind)[..., None], tile)[:, 0]
-    light = _light(lists, width, height)
-    v_records, v_colors = lists.records.new_zeros(6, C * N), colors.new_zeros(D, len(lists.colors))
+    light = _light(scene, width, height)
+    v_records, v_colors = torch.zeros_like(scene.records), colors.new_zeros(D, len(scene.colors))
     v_abs = means2d.new_zeros(2, C * N if absgrad else 0)
-    memory = _Memory(lists, 5)
+    highest = float(scene.records.new_tensor(alpha_max).div_(1 - scene.records.new_tensor(alpha_max)))     # rounded as odds are
+    memory = Memory(scene.records, tile * tile, D + 1, 4)
 
     def backward_group(group: _Group) -> tuple[_Group, Tensor, Tensor, list[Tensor]]:
         coefficients = footprint.coefficients(group.record, group.qx, group.qy)
         slopes = footprint.mean_slopes(group.record, group.qx, group.qy) if absgrad else ()
         group_light, group_rest, group_upstream = (v.index_select(0, group.tiles) for v in (light, rest, upstream))
-        moments, v_color = torch.empty_like(coefficients), colors.new_empty(len(group.tiles), D, group.qx.shape[1])
+        moments, v_color = (colors.new_empty(len(group.tiles), n, group.qx.shape[1]) for n in (6, D))
         sums = [torch.empty_like(group.qx) for _ in slopes]
-        for part, (alpha, weight, T, v, product) in memory.blocks(group):
-            _weights(lists, coefficients[part], group.clamps, group_light[part], alpha, weight, T)
+        for part, (odds, weight, T, v) in memory.blocks(*group.qx.shape):
+            _weights(scene, coefficients[part], group.clamps, group_light[part], odds, weight, T)
             torch.bmm(group_upstream[part].mT, group.colors[part].mT, out=v)                # g
             torch.bmm(group_upstream[part, :D], weight, out=v_color[part])
-            _log_alpha_gradient(v, weight, T, product, group_rest[part])
-            if group.clamps:    # v = 0 where alpha is 0, as it is already, or alpha_max: a comparison and a mask take several times as long
-                torch.ops.aten.hardtanh_backward.grad_input(v, alpha, 0.0, alpha_max, grad_input=v)
-            torch.matmul(lists.monomials, v, out=moments[part])
+            _log_alpha_gradient(v, odds, weight, T, group_rest[part])
+            if group.clamps:    # v = 0 where the odds are 0, as it is already, or those of alpha_max
+                torch.ops.aten.hardtanh_backward.grad_input(v, odds, 0.0, highest, grad_input=v)
+            torch.matmul(scene.monomials, v, out=moments[part])
             for slope, sum_abs in zip(slopes, sums, strict=True):
-                torch.matmul(lists.monomials[:3].T, slope[part], out=T)
+                torch.matmul(scene.monomials[:3].T, slope[part], out=T)
                 torch.sum(T.mul_(v).abs_(), 1, out=sum_abs[part])
         light.index_copy_(0, group.tiles, group_light)
         rest.index_copy_(0, group.tiles, group_rest)
         return group, footprint.coefficients_backward(group.record, group.qx, group.qy, moments), v_color, sums
 
-    for group, v_record, v_color, sums in lists.run(backward_group, light):
+    for group, v_record, v_color, sums in scene.run(backward_group, light):
         v_records.index_add_(1, group.splats, v_record.flatten(1))
         v_colors.index_add_(1, group.rows, v_color.transpose(0, 1).reshape(D, -1))
         for axis, sum_abs in enumerate(sums):
@@ -253,19 +201,22 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
             v_abs.T.reshape(C, -1, 2))
 
 
-def _log_alpha_gradient(v: Tensor, weight: Tensor, T: Tensor, product: Tensor, rest: Tensor) -> None:
-    """Turn v from g into dL/dlog alpha, in place, using up T and `product`; `rest` `[B, P]` in front of the chunk becomes that behind."""
-    torch.mul(weight, v, out=product)
-    product[..., 0].sub_(rest)
-    torch.cumsum(product, -1, out=product)                                                  # minus the rest behind each splat
-    torch.neg(product[..., -1], out=rest)
-    v.add_(product.div_(T.clamp_(min=TINY))).mul_(weight)
+def _log_alpha_gradient(v: Tensor, odds: Tensor, weight: Tensor, rests: Tensor, rest: Tensor) -> None:
+    """Turn v from g into dL/dlog alpha, in place; `rests` is room, and `rest` `[B, P]` in front of the chunk becomes that behind."""
+    v.mul_(weight)
+    first = v[..., 0].clone()
+    v[..., 0].sub_(rest)
+    torch.cumsum(v, -1, out=rests)                                                          # minus the rest behind each splat
+    v[..., 0] = first
+    torch.neg(rests[..., -1], out=rest)
+    v.addcmul_(odds, rests)
 
 
-def _next(steps: Iterator[R]) -> R | None:
-    return next(steps, None)
+def _lit(light: Tensor) -> Tensor:
+    """Which tiles have a pixel that is not finished."""
+    return light.amax(1) > TRANSMITTANCE_MIN
 
 
-def _light(lists: _Lists, width: int, height: int) -> Tensor:
+def _light(scene: _Scene, width: int, height: int) -> Tensor:
     """Light `[tiles, P]` at the start: 1, and 0 at the pixels of the last tiles that are beyond the border."""
-    return to_tiles(lists.records.new_ones(1, height, width, 1), lists.tile)[:, 0].repeat(lists.shape[0], 1)
+    return to_tiles(scene.records.new_ones(1, height, width, 1), scene.lists.tile)[:, 0].repeat(scene.lists.shape[0], 1)

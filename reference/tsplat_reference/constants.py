@@ -1,5 +1,7 @@
 """The numbers that decide what is drawn; one home for the reference, and for the kernels, which get them as arguments."""
 
+import math
+
 ALPHA_MIN = 1 / 255
 """A splat does not touch a pixel where its alpha is below this (3DGS, section 6)."""
 
@@ -30,3 +32,9 @@ COMPENSATION_MIN = 0.005
 
 LARGEST = 1e12
 """Means, scales and square roots of covariances beyond this are degenerate: such splats are culled."""
+
+EVERYWHERE = 1e-20
+"""The conic of a sphere's outline that is not an ellipse: an ellipse that holds any image."""
+
+ON_OUTLINE = ALPHA_MIN * math.exp(0.5)
+"""The opacity with which binning takes (dx, dy) conic (dx, dy) <= 1 for the ellipse of a splat."""

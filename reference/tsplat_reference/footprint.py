@@ -52,7 +52,8 @@ def coefficients(record: Tensor, qx: Tensor, qy: Tensor) -> Tensor:
     _, _, h, s, w, log_opacity = record
     u = torch.addcmul(qx, s, qy)
     hu, wq, hs = h * u, w * qy, h * s
-    return torch.stack([log_opacity - hu * u - wq * qy, -2 * hu, -2 * torch.addcmul(wq, hu, s), -h, -2 * hs, -torch.addcmul(w, hs, s)], 1)
+    planes = [log_opacity - hu * u - wq * qy, -2 * hu, -2 * torch.addcmul(wq, hu, s), -h, -2 * hs, -torch.addcmul(w, hs, s)]
+    return torch.stack(planes).movedim(0, 1)
 
 
 def coefficients_backward(record: Tensor, qx: Tensor, qy: Tensor, moments: Tensor) -> Tensor:

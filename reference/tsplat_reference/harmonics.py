@@ -16,7 +16,7 @@ from tsplat_reference.parallel import map_chunks
 from tsplat_reference.planes import split
 
 MAX_DEGREE = 4
-CHUNK = 1 << 14
+CHUNK = 1 << 15
 """Splats evaluated at a time where no graph is recorded."""
 
 
@@ -89,12 +89,13 @@ def harmonics_backward(means: Tensor, centers: Tensor, coeffs: Tensor, degree: i
     v_out = torch.where(mask[..., None], v_out, 0.0)
     used = (degree + 1) ** 2
     unit, length = _directions(means, centers, mask)
-    tables = _table(degree, unit)
-    basis, *slopes = (_monomials(unit, degree) @ tables.movedim(0, 1).flatten(1)).split(used, -1)  # type: ignore[no-untyped-call]
-    v_coeffs = torch.zeros_like(coeffs)
-    v_coeffs[:, :used] = torch.einsum("cnk,cnd->nkd", basis, v_out)
-    v_basis = torch.einsum("cnd,nkd->cnk", v_out, coeffs[:, :used])
-    v_unit = torch.stack([(slope * v_basis).sum(-1) for slope in slopes], -1)
+    both = (_monomials(unit, degree) @ _table(degree, unit).movedim(0, 1).reshape(-1, 4 * used)).view(*mask.shape, 4, used)
+    basis, slopes = both[..., 0, :], both[..., 1:, :]
+    v_coeffs = torch.einsum("cnk,cnd->nkd", basis, v_out)
+    if used < coeffs.shape[1]:
+        v_coeffs = torch.nn.functional.pad(v_coeffs, (0, 0, 0, coeffs.shape[1] - used))
+    v_basis = coeffs[:, :used] @ v_out[..., None]
+    v_unit = (slopes @ v_basis)[..., 0]
     v_dirs = (v_unit - unit * (unit * v_unit).sum(-1, keepdim=True)) / length
     v_dirs = torch.where((v_out != 0).any(-1, keepdim=True), v_dirs, 0.0)                   # 0 also where the coefficients are NaN
     return v_dirs.sum(0), -v_dirs.sum(1), v_coeffs

@@ -15,7 +15,7 @@ from tsplat_reference.constants import ALPHA_MIN, COMPENSATION_MIN, LARGEST
 from tsplat_reference.parallel import map_chunks
 from tsplat_reference.planes import Matrix, Plane, Vector, cross, dot, join, matmul, split, total, transpose
 
-CHUNK = 1 << 14
+CHUNK = 1 << 15
 """Splats projected at a time where no graph is recorded, so that the planes (about 100 per camera) stay in the cache."""
 
 

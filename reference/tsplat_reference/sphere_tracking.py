@@ -60,19 +60,17 @@ def hit_weights(centers: Tensor, radii: Tensor, opacities: Tensor, gamma: Tensor
     Args: as those of `blend_spheres`, and its logsumexp.
     """
     C, H, W, n = hits.shape
-    if not centers.shape[1]:                            # nothing to gather from
-        return centers.new_full(hits.shape, torch.inf), centers.new_zeros(hits.shape)
     is_hit = hits >= 0
-    index = hits.clamp_min(0).long().view(C, -1)
+    index = torch.where(is_hit, hits, centers.shape[1]).long().view(C, -1)                  # of a sphere of zeros where there is none
 
     def take(values: Tensor) -> Tensor:
-        return values.expand(C, -1).gather(1, index).view(C, H, W, n)
+        return torch.nn.functional.pad(values.expand(C, -1), (0, 1)).gather(1, index).view(C, H, W, n)
 
     fx, fy, cx, cy = (v[..., None, None] for v in split_intrinsics(Ks))
     column = torch.arange(W, device=hits.device, dtype=centers.dtype)[:, None] + 0.5
     row = torch.arange(H, device=hits.device, dtype=centers.dtype)[:, None, None] + 0.5
     x, y, z = (take(v) for v in centers.unbind(-1))
-    R, o = torch.where(is_hit, take(radii), 0.0), take(opacities)
+    R, o = take(radii), take(opacities)
     _, d, D = ray_hits((column - cx) / fx, (row - cy) / fy, x, y, z, R, model, near, far, chord)
     logit = o * (1 - (D - near) / (far - near)) / gamma - logsumexp[..., None]
     weights = o * d * torch.where(is_hit, logit, 0.0).exp()

@@ -13,7 +13,6 @@ the ray from the centre, or with `chord` that of the centre from the ray's point
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import torch
@@ -22,14 +21,10 @@ from torch import Tensor
 from tsplat_reference.binning import tile_counts
 from tsplat_reference.blending import pixel_centers, to_image, to_tiles
 from tsplat_reference.camera import split_intrinsics
-from tsplat_reference.constants import ALPHA_MIN
+from tsplat_reference.constants import EVERYWHERE, ON_OUTLINE
 
 PAIRS = 1 << 20
 """Pixel-sphere pairs of a group of tiles evaluated at a time."""
-EVERYWHERE = 1e-20
-"""The conic of an outline that is not an ellipse: an ellipse that holds any image."""
-ON_OUTLINE = ALPHA_MIN * math.exp(0.5)
-"""The opacity with which binning takes (dx, dy) conic (dx, dy) <= 1 for the ellipse of a splat."""
 
 
 class Outlines(NamedTuple):

@@ -16,26 +16,26 @@ R = TypeVar("R")
 CHUNK = 64
 """Splats of a tile per chunk. Finished pixels end with it, so more would waste work; fewer would pay the calls more often."""
 BLOCK = 1 << 18
-"""Pairs in a block: its buffers of this size, 5 MB in float32 where there are five, are the working set of a thread. Smaller ones fit closer
+"""Pairs in a block: its buffers of this size, 4 MB in float32 where there are four, are the working set of a thread. Smaller ones fit closer
 caches, but then the calls cost more than that gains (measured from 2^15 to 2^19)."""
 GROUP = 1 << 15
 """Hits of a group of blocks, whose small operations (gathering, coefficients, scattering) are done together, by one thread: about 60
 numbers per hit, 8 MB in float32. With more than 8 channels a group has fewer hits."""
+FEW = 1 << 13
+"""Hits of a group below which its chunks grow, up to twofold each time: the calls for a few tiles with long lists cost more than their work."""
 GROUP_TILES = 128
-"""Where there are few tiles: no smaller groups than this."""
+"""Where there are few tiles for several threads: no smaller groups than this."""
 WORTH_WORKERS = 1 << 18
 """Hits from which worker threads gain: at 70k, two threads take 1.1 times as long as one; at 700k, 0.65 times."""
 
 
 class Chunk(NamedTuple):
-    """Splats begin..begin + k of G tiles.
+    """K splats of each of G tiles.
 
     tiles: `[G]`. splats: `[G K]`, int64, as index_add is 20 times slower with int32. padding: `[G, K]`, beyond the end of a list.
     """
 
     tiles: Tensor
-    begin: int
-    k: int
     splats: Tensor
     padding: Tensor
 
@@ -50,17 +50,20 @@ class TileLists:
     shape: tuple[int, int, int]
     tile: int
 
-    def run(self, function: Callable[[Chunk], R], alive: Callable[[Tensor, int], Tensor | None], channels: int) -> Iterator[R]:
+    def run(self, function: Callable[[Chunk], R], alive: Callable[[Tensor, int], Tensor | None], channels: int, grow: bool = True
+            ) -> Iterator[R]:
         """The results of `function` of all that is to do, in an order that the number of threads does not change.
 
         `alive(tiles, begin)` says which tiles need their splats from `begin` on (None: all). Groups of tiles go front to back beside each
-        other, each at its own pace: no core waits for the slowest group of a round.
+        other, each at its own pace: no core waits for the slowest group of a round. Without `grow`, all chunks begin at multiples of CHUNK.
         """
         tiles = self.counts.sort(descending=True, stable=True).indices[:int((self.counts > 0).sum())]     # longest lists first
-        size = GROUP * 9 // (CHUNK * max(9, channels))
-        size = max(1, min(size, max(GROUP_TILES, -(-len(tiles) // 8))))                     # some groups for each core
-        strands = [map(function, self._chunks(some, alive)) for some in torch.split(tiles, size)]
-        with workers(int(self.counts.sum()) >= WORTH_WORKERS) as ordered_map:
+        size = max(1, GROUP * 9 // (CHUNK * max(9, channels)))
+        worth = int(self.counts.sum()) >= WORTH_WORKERS
+        if worth:
+            size = min(size, max(GROUP_TILES, -(-len(tiles) // 8)))                         # some groups for each core
+        strands = [map(function, self._chunks(some, alive, grow)) for some in torch.split(tiles, size)]
+        with workers(worth) as ordered_map:
             yield from (result for result in ordered_map(_next, strands, repeat=True) if result is not None)
 
     def centers(self, tiles: Tensor, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
@@ -68,19 +71,18 @@ class TileLists:
         return ((tiles % self.shape[2] * self.tile).to(dtype) + self.tile / 2,
                 (tiles // self.shape[2] % self.shape[1] * self.tile).to(dtype) + self.tile / 2)
 
-    def _chunks(self, tiles: Tensor, alive: Callable[[Tensor, int], Tensor | None]) -> Iterator[Chunk]:
+    def _chunks(self, tiles: Tensor, alive: Callable[[Tensor, int], Tensor | None], grow: bool) -> Iterator[Chunk]:
         """The splats of a group of tiles, front to back; tiles that have or need no more drop out."""
         counts = self.counts[tiles]
         begin = 0
         while len(tiles):
-            k = min(CHUNK, int(counts[0]) - begin)
+            few = min(begin, FEW // len(tiles), BLOCK // self.tile**2) if grow else 0
+            k = min(max(CHUNK, few), int(counts[0]) - begin)
             at = (self.starts[tiles] + begin)[:, None] + torch.arange(k)                    # [G, K]
             padding = torch.arange(begin, begin + k) >= counts[:, None]
-            splats = self.ids.index_select(0, at.clamp_(max=len(self.ids) - 1).flatten()).long()
-            yield Chunk(tiles, begin, k, splats, padding)
-            begin += CHUNK
-            left = counts > begin
-            needed = alive(tiles, begin)
+            yield Chunk(tiles, self.ids.index_select(0, at.clamp_(max=len(self.ids) - 1).flatten()).long(), padding)
+            begin += k
+            left, needed = counts > begin, alive(tiles, begin)
             live = (left if needed is None else left & needed).nonzero().squeeze(-1)
             tiles, counts = tiles.index_select(0, live), counts.index_select(0, live)
 

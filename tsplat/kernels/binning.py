@@ -234,7 +234,7 @@ class _Splats:
         self.shapes = means2d.contiguous(), conics.contiguous(), opacities.contiguous()
         self.radii = radii.contiguous()
         self.options = {"EPS": torch.finfo(means2d.dtype).eps, "TILE": tile, "SIDE": SIDE.value, **launch("bin"), "enable_fp_fusion": True}
-        self.programs = ceil_div(self.R, launch("bin")["BLOCK"])
+        self.programs = ceil_div(self.R, self.options["BLOCK"])
         self.counts = torch.empty(self.R, dtype=torch.int32, device=means2d.device)
         self.totals = torch.zeros(2, dtype=torch.int64, device=means2d.device)
         if self.R:
@@ -256,7 +256,7 @@ class _Splats:
         keys, by_key = keys.sort(stable=True)
         edges = torch.empty(bins + 1, dtype=torch.int64, device=device)
         sorted_ids, masks = torch.empty_like(unsorted), torch.empty(SIDE.value, coarse, dtype=torch.uint8, device=device)
-        mask_kernel[(ceil_div(coarse + 1, launch("bin")["BLOCK"]),)](keys, by_key, unsorted, *self.shapes, edges, sorted_ids, masks, coarse,
+        mask_kernel[(ceil_div(coarse + 1, self.options["BLOCK"]),)](keys, by_key, unsorted, *self.shapes, edges, sorted_ids, masks, coarse,
                                                                      bins, *self.bins, *self.size, **self.options)
         del unsorted, by_key, keys
         grid, options = (bins, SIDE.value), {"SIDE": SIDE.value, **launch("pick")}

@@ -7,8 +7,6 @@ channels go through matrix products, in `feature_blending.py`.
 
 from __future__ import annotations
 
-import functools
-
 import torch
 import triton
 import triton.language as tl
@@ -20,14 +18,18 @@ from tsplat.kernels.footprint import LOG2_MIN, SUMS, T_MIN, TILE
 from tsplat.kernels.launch import Launcher, ceil_div, current_target, launch
 from tsplat.kernels.tiles import (
     block_pixels,
+    blocks,
     glue,
     half_pixels,
     halves,
+    lane_x,
     load_batch,
     load_pixels,
     load_record,
     of_batch,
     prefetch_records,
+    row_dot,
+    row_moments,
     store_channels,
     tile_list,
     tile_sums,
@@ -35,6 +37,11 @@ from tsplat.kernels.tiles import (
 
 CHANNELS = 4
 """Up to here a splat's colour is in its record and a pixel's in registers."""
+T_ONE = tl.constexpr(2.0**-126 / T_MIN.value)
+T_END = tl.constexpr(2.0**-126)
+BOOST = tl.constexpr(8)
+"""Units of the forward, which so needs no test of T: a transmittance of 1 is T_ONE, and a pixel is finished below T_END, the least number in
+float32 that `mul.ftz` does not take for 0. Weights are 2^BOOST times as large, so that none that counts is below T_END."""
 
 
 @triton.jit
@@ -59,9 +66,32 @@ def splat_alpha(mx, my, l00, l10, l11, log2_opacity, x, y, T, log2_alpha: tl.con
 
 
 @triton.jit
-def without_last(w, T):
+def forward_weight(mx, my, l00, l10, l11, log2_opacity, x, y, T, log2_alpha: tl.constexpr, ALPHA_MAX: tl.constexpr, FLUSH: tl.constexpr,
+                   PREDICATES: tl.constexpr):
+    """T alpha in the forward's units, and where alpha is not below 1/255: elsewhere the weight is 0, or anything with PREDICATES."""
+    power = log2_alpha(mx, my, l00, l10, l11, log2_opacity + BOOST, x, y)
+    alpha = tl.minimum(tl.exp2(power), tl.full((), ALPHA_MAX * 2**BOOST, x.dtype))
+    shown = power >= LOG2_MIN + BOOST
+    if not PREDICATES:
+        alpha = tl.where(shown, alpha, 0.0)
+    if FLUSH:                                           # an instruction less of 14 than a test
+        w = tl.inline_asm_elementwise("mul.ftz.f32 $0, $1, $2;", "=f,f,f", [T, alpha], dtype=tl.float32, is_pure=True, pack=1)
+    else:
+        w = tl.where(T >= T_END, T, 0.0) * alpha
+    return w, shown
+
+
+@triton.jit
+def add_where(shown, total, value, PREDICATES: tl.constexpr):
+    """The total and the value, where it is shown. Where that is one instruction, as on sm_90, it saves the select of weights, 1 of 13; in what
+    the compiler makes of it for others, it costs more than that."""
+    return tl.where(shown, total + value, total) if PREDICATES else total + value
+
+
+@triton.jit
+def without_last(w, T, behind, T_MIN: tl.constexpr):
     """Without the splat that would take the transmittance to T_MIN or below: there the pixel is finished, with T negative as a sign of it."""
-    last = (w > 0) & (T - w <= T_MIN)
+    last = (w > 0) & (behind <= T_MIN)
     return tl.where(last, 0.0, w), tl.where(last, -T, T)
 
 
@@ -69,12 +99,11 @@ def without_last(w, T):
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null"])
 def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, W, H, tiles_x, tiles_y, null, D: tl.constexpr,
                      BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, DROP_LAST: tl.constexpr, log2_alpha: tl.constexpr,
-                     LANES: tl.constexpr, PTX: tl.constexpr):
+                     LANES: tl.constexpr, PTX: tl.constexpr, PREDICATES: tl.constexpr):
     """Image `[C, H, W, D]` and alpha `[C, H, W]` of a block of tiles."""
     view, tile, exists, left, top, x, y, column4, pixel4 = block_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
     cx = left.to(x.dtype) + TILE / 2
-    cy = top.to(x.dtype) + TILE / 2
-    T = glue(tl.where(column4 < W, 1.0, 0.0), tl.where(column4 + 1 < W, 1.0, 0.0)) + x * 0.0     # beyond the border finished
+    T = glue(tl.where(column4 < W, T_ONE, 0.0), tl.where(column4 + 1 < W, T_ONE, 0.0)) + x * 0.0     # beyond the border finished
     C0 = x * 0.0
     C1 = x * 0.0
     C2 = x * 0.0
@@ -85,29 +114,35 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
     following = load_batch(ids, start, TILE, hits, null)
     while i < longest:
         later = load_batch(ids, start, i + 2 * TILE, hits, null)        # two batches ahead, so that nothing waits for it
-        prefetch_records(records, following, PTX)
+        prefetch_records(records, following, 12, PTX)
         u = 0
         while u < TILE:                                                 # a loop: unrolled, it takes more registers and is no faster
             splat = of_batch(batch, u, ids, start, i, hits, null, PTX)
             r = load_record(records, splat, D)
-            w = T * splat_alpha(r[0] - cx, r[1] - cy, r[2], r[3], r[4], r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
+            w, shown = forward_weight(r[0] - cx, r[1], r[2], r[3], r[4], r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX and not DROP_LAST, PREDICATES)
             if DROP_LAST:
-                w, T = without_last(w, T)
-            C0 += r[6] * w
+                w, T = without_last(w, T, T - w * 2**-BOOST, T_END)
+            C0 = add_where(shown, C0, r[6] * w, PREDICATES)
             if D > 1:
-                C1 += r[7] * w
+                C1 = add_where(shown, C1, r[7] * w, PREDICATES)
             if D > 2:
-                C2 += r[8] * w
+                C2 = add_where(shown, C2, r[8] * w, PREDICATES)
             if D > 3:
-                C3 += r[9] * w
-            T -= w
+                C3 = add_where(shown, C3, r[9] * w, PREDICATES)
+            T = add_where(shown, T, w * -2**-BOOST, PREDICATES)
             u += 1
         i += TILE
         batch = following
         following = later
-        longest = tl.where(tl.max(tl.max(T, 1), 0) > T_MIN, longest, 0)     # finished tiles are only looked for once per batch
+        longest = tl.where(tl.max(tl.max(T, 1), 0) > T_END, longest, 0)     # finished tiles are only looked for once per batch
     if DROP_LAST:
         T = tl.abs(T)
+    T *= tl.full((), 1 / T_ONE, x.dtype)                # in float32, too, 1 where no splat is
+    unit = tl.full((), 2**-BOOST / T_ONE, x.dtype)
+    C0 *= unit
+    C1 *= unit
+    C2 *= unit
+    C3 *= unit
     if BACKGROUND:
         b = backgrounds + view * D
         C0 += T * tl.load(b)
@@ -142,7 +177,6 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
     """
     view, tile, exists, left, top, x, y, column4, pixel4 = block_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
     cx = left.to(x.dtype) + TILE / 2
-    cy = top.to(x.dtype) + TILE / 2
     v0 = load_pixels(v_image, pixel4, column4, W, D, 0)
     v1 = load_pixels(v_image, pixel4, column4, W, D, 1)
     v2 = load_pixels(v_image, pixel4, column4, W, D, 2)
@@ -169,20 +203,19 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
     following = load_batch(ids, start, TILE, hits, null)
     while i < longest:
         later = load_batch(ids, start, i + 2 * TILE, hits, null)
-        prefetch_records(records, following, PTX)
+        prefetch_records(records, following, 12, PTX)
         stop = tl.minimum(TILE, longest - i)
         u = 0
         while u < stop:
             splat = of_batch(batch, u, ids, start, i, hits, null, PTX)
-            real = i + u < hits
             r = load_record(records, splat, D)
             mx = r[0] - cx
-            my = r[1] - cy
+            my = r[1]
             l00, l10, l11 = r[2:5]
             alpha = splat_alpha(mx, my, l00, l10, l11, r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
             w = alpha * T
             if DROP_LAST:
-                w, T = without_last(w, T)
+                w, T = without_last(w, T, T - w, T_MIN)
             g = v_weight + r[6] * v0
             if D > 1:
                 g += r[7] * v1
@@ -198,11 +231,12 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
                 reciprocal = 1.0 / T
             v = w * (g - rest * reciprocal)
             v = tl.where(alpha < tl.full((), ALPHA_MAX, x.dtype), v, 0.0)
-            s0, sx, sy, sxx, sxy, syy = lane_moments(v, mx, my, x, y)
-            w0 = tl.sum(w * v0, 1, keep_dims=True)
-            w1 = tl.sum(w * v1, 1, keep_dims=True) if D > 1 else none
-            w2 = tl.sum(w * v2, 1, keep_dims=True) if D > 2 else none
-            w3 = tl.sum(w * v3, 1, keep_dims=True) if D > 3 else none
+            row_s0, row_x, row_xx = row_moments(v)
+            s0, sx, sy, sxx, sxy, syy = lane_moments(row_s0, row_x, row_xx, mx, my, y)
+            w0 = row_dot(w, v0)
+            w1 = row_dot(w, v1) if D > 1 else none
+            w2 = row_dot(w, v2) if D > 2 else none
+            w3 = row_dot(w, v3) if D > 3 else none
             ax = none
             ay = none
             if ABSGRAD:
@@ -211,6 +245,7 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
                 ay = tl.sum(tl.abs(v * slope_y), 1, keep_dims=True)
             COUNT: tl.constexpr = 12 if ABSGRAD or D > 3 else 9
             first, slot, second, second_slot, has_second = tile_sums(s0, sx, sy, sxx, sxy, syy, w0, w1, w2, w3, ax, ay, COUNT, PTX)
+            real = splat != null
             if PER_HIT:
                 q = sums + (start + i + u) * SUMS
                 tl.store(q + slot, first, mask=real)
@@ -224,13 +259,6 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
         batch = following
         following = later
         longest = tl.where(tl.max(tl.max(T, 1), 0) > T_MIN, longest, 0)
-
-
-@functools.cache
-def _lane_x(lanes: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """`[lanes, 4]`: x about the tile's centre of every second pixel of each lane's row."""
-    tile = int(TILE.value)
-    return (torch.arange(0, tile, 2, device=device).to(dtype) - (tile / 2 - 0.5)).repeat(lanes, 1)
 
 
 class _Scene:
@@ -255,10 +283,8 @@ class _Scene:
         target = current_target()
         self.common = {"ALPHA_MAX": alpha_max, "DROP_LAST": drop_last, "log2_alpha": footprint.log2_alpha, "enable_fp_fusion": True}
         lanes, ptx = target.lanes, target.ptx and means2d.dtype == torch.float32
-        # what is made while a CUDA graph is captured has no numbers until its replay: not to be kept
-        capturing = means2d.is_cuda and torch.cuda.is_current_stream_capturing()
-        self.lane_x = (_lane_x.__wrapped__ if capturing else _lane_x)(lanes, means2d.dtype, means2d.device)
-        self.blocks = self.C * ceil_div(self.grid[0], 2) * ceil_div(self.grid[1], lanes // (2 * tile))
+        self.predicates = target.predicates
+        self.lane_x, self.blocks = lane_x(lanes, means2d), self.C * blocks(self.grid, lanes)
         self.warp = {**self.common, "D": self.D, "LANES": lanes, "PTX": ptx}
         self.block = {**self.common, "P": tile * tile, "PRECISION": "tf32x3" if ptx else "ieee"}
 
@@ -271,7 +297,7 @@ def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ba
     has_background = backgrounds is not None
     if s.D <= CHANNELS:
         blend_fwd_kernel[(s.blocks,)](s.records, s.ids, s.offsets, s.backgrounds, image, alphas, s.lane_x, width, height, *s.grid, s.R,
-                                     BACKGROUND=has_background, **launch("blend"), **s.warp)
+                                     BACKGROUND=has_background, PREDICATES=s.predicates and not drop_last, **launch("blend"), **s.warp)
     else:
         options = launch("features")
         feature_fwd_kernel[(s.tiles, ceil_div(s.D, options["DB"]))](

@@ -7,7 +7,7 @@ set of these functions. A record is 12 numbers, three 16-byte loads: mean x, mea
     log2 alpha = log2 o - (l00 dx + l10 dy)^2 - (l11 dy)^2,
 
 the Cholesky factor of the conic times sqrt(log2(e)/2): one FFMA less per pixel than the conic, and better conditioned where a long thin
-splat is centred far away. Positions are relative to the centre of the tile.
+splat is centred far away. Positions x are relative to the centre of the tile.
 """
 
 import math
@@ -46,13 +46,10 @@ def mean_slopes(mx, my, l00, l10, l11, x, y):
 
 
 @triton.jit
-def lane_moments(v, mx, my, x, y):
-    """Per lane: the six sums over the pixels v `[LANES, 8]` of a row at x `[LANES, 8]`, y `[LANES, 1]`."""
-    vx = v * x
-    s0 = tl.sum(v, 1, keep_dims=True)
-    local = tl.sum(vx, 1, keep_dims=True)
-    sx = local - mx * s0                                # shifted from the tile's centre to the mean once per row, not per pixel
-    sxx = tl.sum(vx * x, 1, keep_dims=True) - mx * (local + sx)
+def lane_moments(s0, local_x, local_xx, mx, my, y):
+    """Per lane: the six sums over the pixels of a row at y, of which those of 1, x and x^2 about the tile's centre are given."""
+    sx = local_x - mx * s0                              # shifted to the mean once per row, not per pixel
+    sxx = local_xx - mx * (local_x + sx)
     dy = y - my
     sy = s0 * dy
     return s0, sx, sy, sxx, sx * dy, sy * dy

@@ -20,6 +20,7 @@ class Target:
 
     lanes: int      # threads of a warp (64 on CDNA)
     ptx: bool       # whether NVIDIA's inline assembly is understood
+    predicates: bool = False    # whether the compiler makes a predicated instruction of a sum and a select
 
     @property
     def family(self) -> str:
@@ -43,7 +44,8 @@ def current_target() -> Target:
 def _target(driver: Any, device: Any) -> Target:
     """Held, as to ask for a device's properties takes 5 us, and is done some ten times in a forward and backward."""
     target = driver.get_current_target()
-    return Target(target.warp_size, target.backend == "cuda")
+    nvidia = target.backend == "cuda"
+    return Target(target.warp_size, nvidia, nvidia and target.arch == 90)
 
 
 class Launcher:
@@ -121,6 +123,16 @@ LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "features_colors_backward": {"nvidia": {"K": 16, "DB": 32, "num_warps": 4}, "cdna": {"K": 16, "DB": 32, "num_warps": 4},
                                  "rdna": {"K": 16, "DB": 16, "num_warps": 8}},
     "features_backward": {family: {"K": 16, "DB": 32, "num_warps": 4} for family in FAMILIES},
+    "outlines": {family: _splats(128, 4) for family in FAMILIES},
+    "blend_spheres": {family: {"num_warps": 1} for family in FAMILIES},
+    "blend_spheres_backward": {family: {"num_warps": 1} for family in FAMILIES},
+    "nearest_hits": {family: {"num_warps": 1} for family in FAMILIES},
+    "sphere_features": {"nvidia": {"K": 16, "DB": 64, "num_warps": 8}, "cdna": {"K": 16, "DB": 32, "num_warps": 8},
+                        "rdna": {"K": 16, "DB": 32, "num_warps": 8}},
+    "sphere_features_backward": {"nvidia": {"K": 16, "DB": 32, "num_warps": 4}, "cdna": {"K": 16, "DB": 32, "num_warps": 4},
+                                 "rdna": {"K": 16, "DB": 16, "num_warps": 8}},
+    "sphere_feature_backward": {family: {"K": 16, "DB": 32, "num_warps": 4} for family in FAMILIES},
+    "upstream": {family: {"DB": 4, **_splats(128, 4)} for family in FAMILIES},
 }
 
 

@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import functools
+
+import torch
 import triton
 import triton.language as tl
+from torch import Tensor
 
 from tsplat.kernels.footprint import TILE
+from tsplat.kernels.launch import ceil_div
 
 
 @triton.jit
@@ -27,7 +32,7 @@ def glue(a, b):
 @triton.jit
 def block_pixels(block, lane_x, tiles_x, tiles_y, W, H, LANES: tl.constexpr):
     """The tiles of a block, 2 in each row of it, and a lane's pixels: camera, tile, whether it exists, its left and its top `[LANES, 1]`,
-    x `[LANES, 8]` and y `[LANES, 1]` about its centre, and of every second pixel the column and the index `[LANES, 4]`.
+    x about its centre `[LANES, 8]`, y `[LANES, 1]`, and of every second pixel the column and the index `[LANES, 4]`.
 
     x is loaded rather than made by tl.arange: that anchors the layout with a lane's pixels in its own registers, and all state is derived
     from it (tl.zeros would get another layout and the compiler would run the loop twice).
@@ -49,7 +54,7 @@ def block_pixels(block, lane_x, tiles_x, tiles_y, W, H, LANES: tl.constexpr):
     exists = (tile_x < tiles_x) & (tile_y < tiles_y)
     tile = (view.to(tl.int64) * tiles_y + tile_y) * tiles_x + tile_x
     dt: tl.constexpr = x4.dtype
-    return view, tile, exists, tile_x * TILE, tile_y * TILE, glue(x4, x4 + 1.0), row.to(dt) - (half - 0.5), column4, pixel4
+    return view, tile, exists, tile_x * TILE, tile_y * TILE, glue(x4, x4 + 1.0), y.to(dt) + 0.5, column4, pixel4
 
 
 @triton.jit
@@ -73,6 +78,43 @@ def half_pixels(view, left, top, W, H, first: tl.constexpr):
 def halves(v):
     """The left and the right 4 pixels of each lane's row, each `[LANES, 4]`."""
     return tl.split(tl.permute(tl.reshape(v, (v.shape[0], 2, 4)), (0, 2, 1)))
+
+
+@triton.jit
+def eighths(v):
+    """Each of a lane's 8 pixels, as `[LANES, 1]`."""
+    even, odd = tl.split(tl.reshape(v, (v.shape[0], 4, 2)))
+    v04, v26 = tl.split(tl.reshape(even, (v.shape[0], 2, 2)))
+    v15, v37 = tl.split(tl.reshape(odd, (v.shape[0], 2, 2)))
+    v0, v4 = tl.split(v04)
+    v1, v5 = tl.split(v15)
+    v2, v6 = tl.split(v26)
+    v3, v7 = tl.split(v37)
+    return v0[:, None], v1[:, None], v2[:, None], v3[:, None], v4[:, None], v5[:, None], v6[:, None], v7[:, None]
+
+
+@triton.jit
+def row_dot(a, b):
+    """Sum of a b over a lane's pixels in 8 operations: tl.sum adds them up as a tree, in which only half of the products can be fused (12)."""
+    a = eighths(a)
+    b = eighths(b)
+    total = a[0] * b[0]
+    for k in tl.static_range(1, 8):
+        total += a[k] * b[k]
+    return total
+
+
+@triton.jit
+def row_moments(v):
+    """Sums over a lane's pixels of v, v x and v x^2, x about the tile's centre, in 19 operations: sums and differences of the pixels that
+    mirror each other, as x and x^2 are the same constants for both (with x in registers 31)."""
+    v0, v1, v2, v3, v4, v5, v6, v7 = eighths(v)
+    s0 = v4 + v3
+    s1 = v5 + v2
+    s2 = v6 + v1
+    s3 = v7 + v0
+    x = 0.5 * (v4 - v3) + 1.5 * (v5 - v2) + 2.5 * (v6 - v1) + 3.5 * (v7 - v0)
+    return s0 + s1 + s2 + s3, x, 0.25 * s0 + 2.25 * s1 + 6.25 * s2 + 12.25 * s3
 
 
 @triton.jit
@@ -115,12 +157,12 @@ def of_batch(batch, u, ids, start, i, hits, null, PTX: tl.constexpr):
 
 
 @triton.jit
-def prefetch_records(records, batch, PTX: tl.constexpr):
-    """Have the records of the next batch fetched into L1 while this one is blended, each lane one: 2 sectors of 32 bytes. Half of the cycles
-    of a warp were waiting for them."""
+def prefetch_records(records, batch, RECORD: tl.constexpr, PTX: tl.constexpr):
+    """Have the records, of 8 or 12 numbers, of the next batch fetched into L1 while this one is blended, each lane one: 1 or 2 sectors of 32
+    bytes. Half of the cycles of a warp were waiting for them."""
     if PTX:
-        p = (records + batch.to(tl.int64) * 12).to(tl.int64)
-        for word in tl.static_range(2):
+        p = (records + batch.to(tl.int64) * RECORD).to(tl.int64)
+        for word in tl.static_range((RECORD + 7) // 8):
             tl.inline_asm_elementwise("prefetch.global.L1 [$1]; mov.b32 $0, 0;", "=r,l", [p + 44 * word], dtype=tl.int32, is_pure=False, pack=1)
 
 
@@ -192,3 +234,29 @@ def tile_sums(s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, COUNT: tl.conste
             second = tl.where(row == 2, tile_sum(s10), second)
             second = tl.where(row == 3, tile_sum(s11), second)
         return first, row, second, row + 8, row < COUNT - 8
+
+
+@triton.jit
+def tile_min(v):
+    """Least of the lanes of each tile, in every lane of it (portable)."""
+    groups: tl.constexpr = v.shape[0] // TILE
+    least = tl.min(tl.reshape(v, (groups, TILE)), 1, keep_dims=True)
+    return tl.reshape(tl.broadcast_to(least, (groups, TILE)), (v.shape[0], 1))
+
+
+def blocks(tiles: tuple[int, int], lanes: int) -> int:
+    """How many programs `block_pixels` makes of the tiles (columns, rows) of a camera."""
+    return ceil_div(tiles[0], 2) * ceil_div(tiles[1], lanes // (2 * int(TILE.value)))
+
+
+def lane_x(lanes: int, like: Tensor) -> Tensor:
+    """`[lanes, 4]`: x about the tile's centre of every second pixel of each lane's row."""
+    # what is made while a CUDA graph is captured has no numbers until its replay: not to be kept
+    capturing = like.is_cuda and torch.cuda.is_current_stream_capturing()
+    return (_lane_x.__wrapped__ if capturing else _lane_x)(lanes, like.dtype, like.device)
+
+
+@functools.cache
+def _lane_x(lanes: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    tile = int(TILE.value)
+    return (torch.arange(0, tile, 2, device=device).to(dtype) - (tile / 2 - 0.5)).repeat(lanes, 1)

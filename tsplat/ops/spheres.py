@@ -46,6 +46,7 @@ def _outlines(centers: Tensor, radii: Tensor, Ks: Tensor, width: int, height: in
     return radii2d, means2d, conics, opacities, depths
 
 
+@contiguous
 def _outlines_cpu(*args: Any) -> Five:
     radii2d, means2d, conics, opacities, depths = reference.outlines(*args)
     return radii2d, means2d, conics, opacities, depths

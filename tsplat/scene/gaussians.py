@@ -6,12 +6,12 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from tsplat.checks import check_tensor
+from tsplat.scene.module import Splats
 from tsplat.scene.neighbours import nearest_squared_distances
 
 SH_C0 = 0.28209479177387814      # the constant band of the real spherical harmonics
@@ -20,7 +20,7 @@ MIN_SCALE = 1e-7
 LOAD_SUFFIXES = (".ply",)
 
 
-class Gaussians(nn.Module):
+class Gaussians(Splats):
     """N anisotropic 3D Gaussians with view-dependent colour.
 
     The parameters are raw (unbounded); the properties `scales`, `opacities` and `sh` are what the renderer takes.
@@ -48,11 +48,7 @@ class Gaussians(nn.Module):
 
     def __init__(self, means: Tensor, quats: Tensor, log_scales: Tensor, opacity_logits: Tensor, sh0: Tensor,
                  sh_rest: Tensor) -> None:
-        super().__init__()
-        tensors = dict(zip(self.NAMES, (means, quats, log_scales, opacity_logits, sh0, sh_rest), strict=True))
-        _check(tensors)
-        for name, tensor in tensors.items():
-            self.register_parameter(name, nn.Parameter(tensor.detach().clone()))
+        super().__init__(means=means, quats=quats, log_scales=log_scales, opacity_logits=opacity_logits, sh0=sh0, sh_rest=sh_rest)
 
     @property
     def scales(self) -> Tensor:
@@ -73,9 +69,6 @@ class Gaussians(nn.Module):
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 4."""
         return math.isqrt(self.sh_rest.shape[1] + 1) - 1
-
-    def __len__(self) -> int:
-        return self.means.shape[0]
 
     def extra_repr(self) -> str:
         """What `repr` shows."""
@@ -145,29 +138,19 @@ class Gaussians(nn.Module):
         _check_suffix(path)
         write_ply(path, self)
 
-    def _load_from_state_dict(self, state_dict: Mapping[str, Any], prefix: str, *args: Any) -> None:
-        """Take on the size of the saved tensors first: training changes N."""
-        saved = {name: state_dict[prefix + name] for name in self.NAMES if prefix + name in state_dict}
-        if len(saved) == len(self.NAMES):
-            _check(saved)
-            for name, tensor in saved.items():
-                parameter = self.get_parameter(name)
-                if parameter.shape != tensor.shape:
-                    parameter.data, parameter.grad = parameter.new_empty(tensor.shape), None
-        super()._load_from_state_dict(state_dict, prefix, *args)
-
-
-def _check(tensors: Mapping[str, Tensor]) -> None:
-    means, sh_rest = tensors["means"], tensors["sh_rest"]
-    check_tensor("means", means, ("N", 3))
-    n = len(means)
-    shapes = {"quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,), "sh0": (n, 1, 3), "sh_rest": (n, "K - 1", 3)}
-    for name, shape in shapes.items():
-        check_tensor(name, tensors[name], shape, like=means)
-    sizes = [(degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)]
-    if sh_rest.shape[1] not in sizes:
-        raise ValueError(f"sh_rest: expected {', '.join(map(str, sizes))} coefficients (degree 0 to {MAX_SH_DEGREE}); "
-                         f"got {sh_rest.shape[1]}")
+    @classmethod
+    def check(cls, tensors: Mapping[str, Tensor]) -> None:
+        """See `Splats.check`."""
+        means, sh_rest = tensors["means"], tensors["sh_rest"]
+        check_tensor("means", means, ("N", 3))
+        n = len(means)
+        shapes = {"quats": (n, 4), "log_scales": (n, 3), "opacity_logits": (n,), "sh0": (n, 1, 3), "sh_rest": (n, "K - 1", 3)}
+        for name, shape in shapes.items():
+            check_tensor(name, tensors[name], shape, like=means)
+        sizes = [(degree + 1) ** 2 - 1 for degree in range(MAX_SH_DEGREE + 1)]
+        if sh_rest.shape[1] not in sizes:
+            raise ValueError(f"sh_rest: expected {', '.join(map(str, sizes))} coefficients (degree 0 to {MAX_SH_DEGREE}); "
+                             f"got {sh_rest.shape[1]}")
 
 
 def _check_suffix(path: str | os.PathLike[str]) -> None:

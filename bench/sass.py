@@ -72,7 +72,7 @@ def compile_only(target: GPUTarget) -> Iterator[list[Any]]:
 
 def launch_everything(quick: bool) -> Iterator[tuple[str, Any]]:
     """Each launch, with the name of its variant; `quick` gives one or two variants of each kernel."""
-    from tsplat.kernels import binning, blending, harmonics, projection
+    from tsplat.kernels import adam, binning, blending, harmonics, projection
 
     C, N, W, H = 2, 1000, 640, 480
 
@@ -95,6 +95,9 @@ def launch_everything(quick: bool) -> Iterator[tuple[str, Any]]:
         coeffs = t(N, (degree + 1) ** 2, 3)
         yield f"degree {degree}", lambda d=degree, k=coeffs, m=mask: harmonics.harmonics(t(N, 3), t(C, 3), k, d, m)
         yield f"degree {degree}", lambda d=degree, k=coeffs, m=mask: harmonics.harmonics_backward(t(N, 3), t(C, 3), k, d, m, t(C, N, 3))
+    for shape in ((), (3,), (15, 3)) if not quick else ((), (15, 3)):
+        rows = [t(N, *shape) for _ in range(4)]
+        yield f"rows {list(shape)}", lambda r=rows: adam.adam_rows(*r, t(N), t(N, dtype=torch.bool), 1e-3, 0.9, 0.999, 1e-15)
     yield "", lambda: binning.bin_splats_fixed(splats[0], radii, splats[1], splats[2], t(C, N), W, H, 8, 5000)
     every = ((1, False), (3, False), (3, True), (4, False), (32, False), (128, False))
     for D, absgrad in (every[1], every[4]) if quick else every:

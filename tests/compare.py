@@ -65,6 +65,16 @@ def threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
+def guarded(tensor: Tensor | None) -> Tensor | None:
+    """The same numbers with NaN (or, for indices, numbers far out of range) before and after them in memory."""
+    if tensor is None:
+        return None
+    fill = float("nan") if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max // 2
+    memory = torch.full((tensor.numel() + 128,), fill, dtype=tensor.dtype)
+    inner = memory[64:64 + tensor.numel()].view(tensor.shape)
+    return inner.copy_(tensor)
+
+
 def strided(tensor: Tensor) -> Tensor:
     """The same values, with gaps in memory and the dimensions in reverse order."""
     reverse = list(range(tensor.ndim))[::-1]

@@ -27,5 +27,6 @@ def test_no_kernel_spills(target: str, tmp_path: Path) -> None:
     names = {k["kernel"] for k in kernels}
     assert {"blend_fwd_kernel", "blend_bwd_kernel", "feature_fwd_kernel", "feature_bwd_kernel", "count_kernel", "emit_kernel"} <= names
     assert any("project" in n for n in names)
+    assert "adam_rows_kernel" in names
     assert any("harmonics" in n for n in names)
     assert {(k["kernel"], k["label"]): k["spills"] for k in kernels if k["spills"] != 0} == {}

@@ -9,7 +9,7 @@ import pytest
 import scenes
 import torch
 import tsplat_reference as reference
-from compare import assert_close
+from compare import assert_close, guarded
 from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton is not installed here")
@@ -33,16 +33,6 @@ class Case:
     @property
     def arguments(self) -> tuple[Tensor | int | float | None, ...]:
         return *self.splats[:5], *self.bins, self.width, self.height, TILE, ALPHA_MAX, self.drop_last
-
-
-def guarded(tensor: Tensor | None) -> Tensor | None:
-    """The same numbers with NaN (or, for indices, numbers far out of range) before and after them in memory."""
-    if tensor is None:
-        return None
-    fill = float("nan") if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max // 2
-    memory = torch.full((tensor.numel() + 128,), fill, dtype=tensor.dtype)
-    inner = memory[64:64 + tensor.numel()].view(tensor.shape)
-    return inner.copy_(tensor)
 
 
 def case(cameras: int, n: int, width: int, height: int, *, dtype: torch.dtype = torch.float64, device: str = "cpu",

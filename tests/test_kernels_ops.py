@@ -42,6 +42,22 @@ def inputs(n: int = 8, device: str = DEVICE, cameras: int = 2) -> list[Tensor]:
     return [x.to(device).requires_grad_() for x in every]
 
 
+def render_spheres(*inputs: Tensor) -> tuple[Tensor, ...]:
+    """All that spheres have."""
+    positions, features, radii, opacities, viewmats, Ks, gamma = inputs
+    r = tsplat.render_spheres(positions, features, radii, tsplat.Camera(viewmats, Ks, WIDTH, HEIGHT), opacities=opacities, gamma=gamma, near=0.5,
+                              far=8.0, depth="expected", n_track=2)
+    assert r.depth is not None
+    assert r.hits is not None
+    return r.image, r.alpha, r.depth, r.hits.weights
+
+
+def sphere_inputs(device: str = DEVICE) -> list[Tensor]:
+    camera = scenes.camera(2, WIDTH, HEIGHT)
+    every = *scenes.spheres(8), camera.viewmats, camera.Ks, torch.tensor(0.1, dtype=torch.float64)
+    return [x.to(device).requires_grad_() for x in every]
+
+
 def values_and_gradients(function: Callable[..., tuple[Tensor, ...]], leaves: list[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
     outputs = function(*leaves)
     v = [torch.linspace(-1, 1, x.numel(), dtype=x.dtype, device=x.device).view_as(x) for x in outputs]
@@ -98,6 +114,7 @@ def test_opcheck_of_every_op() -> None:
         with record(calls):
             values_and_gradients(render, leaves)
             render(*leaves, capacity=200)
+            values_and_gradients(render_spheres, sphere_inputs())
         assert set(calls) == {op.custom._qualname for op in OPS}
         for op in OPS:
             opcheck(op.custom, calls[op.custom._qualname], test_utils=("test_schema", "test_faketensor"))
@@ -134,9 +151,10 @@ def test_a_cpu_tensor_never_touches_triton(monkeypatch: pytest.MonkeyPatch) -> N
     def fail(*_: Any) -> None:
         raise AssertionError("a kernel ran")
 
-    for module in ("projection", "harmonics", "binning", "blending"):
+    for module in ("projection", "harmonics", "binning", "blending", "spheres"):
         monkeypatch.setattr(importlib.import_module(f"tsplat.ops.{module}"), "run_kernel", fail)
     render(*inputs(device="cpu"))
+    values_and_gradients(render_spheres, sphere_inputs(device="cpu"))
 
 
 class Compiler:
@@ -167,7 +185,7 @@ class Compiler:
         return "stream"
 
     def get_current_target(self) -> Any:
-        return SimpleNamespace(backend="cuda", warp_size=32)
+        return SimpleNamespace(backend="cuda", arch=90, warp_size=32)
 
 
 @pytest.fixture

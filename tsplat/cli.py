@@ -1,4 +1,4 @@
-"""The command line: `tsplat fit`, `tsplat render`, `tsplat info`."""
+"""The command line: `tsplat fit`, `tsplat eval`, `tsplat render`, `tsplat convert`, `tsplat info`."""
 
 from __future__ import annotations
 
@@ -17,14 +17,18 @@ from torch import Tensor
 
 import tsplat
 from tsplat.camera import Camera
-from tsplat.fit import FitConfig, draw, fit
+from tsplat.fit import FitConfig, Quality, draw, evaluate, fit
+from tsplat.fit.evaluation import mean_quality
+from tsplat.fit.output import metrics_of, read_config, write_json
 from tsplat.scene import Gaussians, load_capture, write_image, write_synthetic_capture
+from tsplat.scene.formats import FORMATS, find_format, is_sog
 
 INTERRUPTED = 130                    # the exit status of a shell's command that was stopped by Ctrl-C
 AXES = {sign + axis: tuple(float(f"{sign}1") * (axis == a) for a in "xyz") for sign in ("", "-") for axis in "xyz"}
 SIZE = (800, 600)
 ELEVATION = 20.0                     # degrees above the horizon, for cameras that frame the scene
 FRAMED = 0.95                        # part of the splats to be in the picture; the others may be far away
+SCENE = f"a scene file ({', '.join(item.suffix for item in FORMATS)})"
 QUANTILES = (0.0, 0.05, 0.5, 0.95, 1.0)
 
 
@@ -43,7 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt as interrupt:
         print(f"tsplat: {interrupt or 'interrupted'}", file=sys.stderr)
         return INTERRUPTED
-    except (ValueError, OSError, ArithmeticError, NotImplementedError, MemoryError) as error:
+    except (ValueError, OSError, ArithmeticError, NotImplementedError, MemoryError, ImportError) as error:
         if debug:
             raise
         print(f"tsplat: error: {_text(error)}", file=sys.stderr)
@@ -58,44 +62,69 @@ def _text(error: Exception) -> str:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="tsplat", description="Fit, render and inspect scenes of Gaussian splats.")
+    parser = argparse.ArgumentParser(prog="tsplat", description="Fit, render, convert and inspect scenes of Gaussian splats.")
     parser.add_argument("--version", action="version", version=f"tsplat {tsplat.__version__}")
     commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
     shared = argparse.ArgumentParser(add_help=False)
     shared.add_argument("--debug", action="store_true", help="show where an error came from (also: TSPLAT_DEBUG=1)")
     _add_fit(commands.add_parser("fit", parents=[shared], help="fit a scene to photos"))
+    _add_eval(commands.add_parser("eval", parents=[shared], help="measure a scene file against held-out photos"))
     _add_render(commands.add_parser("render", parents=[shared], help="render a scene to PNG"))
+    _add_convert(commands.add_parser("convert", parents=[shared], help="write a scene in another file format"))
     _add_info(commands.add_parser("info", parents=[shared], help="say what is in a scene file or a folder of photos"))
     return parser
 
 
 def _add_fit(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_fit)
-    parser.description = ("Fit Gaussians to posed photos. Writes scene.ply, metrics.json, test/*.png (held-out photo beside "
-                          "render) and checkpoint.pt, from which the same command goes on after an interruption.")
+    parser.description = ("Fit Gaussians to posed photos. Writes scene.ply, metrics.json, config.json, curves.png, test/*.png (held-out "
+                          "photo beside render), contact.png and checkpoint.pt, from which the same command goes on after an interruption.")
     data = parser.add_mutually_exclusive_group(required=True)
     data.add_argument("data", nargs="?", metavar="DATA", help="folder of a COLMAP model with photos, or of a transforms.json")
     data.add_argument("--synthetic", action="store_true",
                       help="no photos at hand: render a small capture of a made-up scene to OUT/capture, and fit that")
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT", help="folder to write to, made if need be")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="a config.json, for what is not given here: makes the same scene again")
     parser.add_argument("--fresh", action="store_true", help="start anew instead of going on from OUT/checkpoint.pt")
     parser.add_argument("--quiet", action="store_true", help="no progress line")
     _add_device(parser)
+    _add_fields(parser, [item.name for item in dataclasses.fields(FitConfig)])
+
+
+def _add_fields(parser: argparse.ArgumentParser, names: Sequence[str]) -> None:
+    """An option for each of these fields of `FitConfig`, which is not in the result if it was not given."""
     kinds = typing.get_type_hints(FitConfig)
     for item in dataclasses.fields(FitConfig):
-        kind, text = kinds[item.name], f"{item.metadata['help']} (default: {item.default})"
+        if item.name not in names:
+            continue
+        kind, text = kinds[item.name], item.metadata["help"]
+        if item.default is None:                                                     # `kind | None`, of which the help says what None means
+            kind = next(k for k in typing.get_args(kind) if k is not type(None))
+        else:
+            text = f"{text} (default: {item.default:g})" if kind is float else f"{text} (default: {item.default})"
         flag = "--" + item.name.replace("_", "-")
         if kind is bool:
-            parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=item.default, help=item.metadata["help"])
+            parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=argparse.SUPPRESS, help=text)
         elif choices := typing.get_args(kind):
-            parser.add_argument(flag, choices=choices, default=item.default, help=text)
+            parser.add_argument(flag, choices=choices, default=argparse.SUPPRESS, help=text)
         else:
-            parser.add_argument(flag, type=kind, default=item.default, metavar=kind.__name__.upper(), help=text)
+            parser.add_argument(flag, type=kind, default=argparse.SUPPRESS, metavar=kind.__name__.upper(), help=text)
+
+
+def _add_eval(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(run=_eval)
+    parser.description = ("Measure a scene against the held-out photos of a capture. What is not given here is taken from the config.json "
+                          "beside the scene, if there is one: then the result is what metrics.json says.")
+    parser.add_argument("scene", type=Path, metavar="SCENE", help="a scene file (.ply)")
+    parser.add_argument("data", metavar="DATA", help="the capture: folder or transforms.json")
+    parser.add_argument("-o", "--out", type=Path, metavar="OUT.json", help="also write the metrics of each photo to this file")
+    _add_device(parser)
+    _add_fields(parser, ("downscale", "test_every", "background", "antialiased"))
 
 
 def _add_render(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_render)
-    parser.add_argument("scene", metavar="SCENE", help="a scene file (.ply)")
+    parser.add_argument("scene", metavar="SCENE", help=SCENE)
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT.png", help="picture to write; its folder is made")
     view = parser.add_mutually_exclusive_group()
     view.add_argument("--camera", metavar="DATA", help="take a camera of this capture (folder or transforms.json)")
@@ -109,9 +138,16 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     _add_device(parser)
 
 
+def _add_convert(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(run=_convert)
+    parser.description = "Write a scene in the format that the name of OUT says; its folder is made."
+    parser.add_argument("scene", metavar="IN", help=SCENE)
+    parser.add_argument("out", type=Path, metavar="OUT", help=f"a scene file ({', '.join(item.suffix for item in FORMATS if item.write)})")
+
+
 def _add_info(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_info)
-    parser.add_argument("path", type=Path, metavar="PATH", help="a scene file (.ply), a capture folder or a transforms.json")
+    parser.add_argument("path", type=Path, metavar="PATH", help=f"{SCENE}, a capture folder or a transforms.json")
 
 
 def _add_device(parser: argparse.ArgumentParser) -> None:
@@ -119,7 +155,7 @@ def _add_device(parser: argparse.ArgumentParser) -> None:
 
 
 def _fit(options: argparse.Namespace) -> None:
-    config = FitConfig(**{item.name: getattr(options, item.name) for item in dataclasses.fields(FitConfig)})
+    config = _config(options, options.config)
     data = options.data
     if options.synthetic:
         data = options.out / "capture"
@@ -127,9 +163,37 @@ def _fit(options: argparse.Namespace) -> None:
             print(f"rendering a small capture of a made-up scene to {data}")
             write_synthetic_capture(data)
     result = fit(data, config, options.out, resume=not options.fresh, progress=not options.quiet, device=_device(options.device))
-    if result.mean is not None:
-        print(f"{len(result.qualities)} held-out photos: PSNR {result.mean.psnr:.2f} dB, SSIM {result.mean.ssim:.4f}")
+    _print_mean(result.qualities)
+    if result.refined_mean is not None:
+        print(f"with their poses refined, too: PSNR {result.refined_mean.psnr:.2f} dB, SSIM {result.refined_mean.ssim:.4f}")
     print(f"{len(result.gaussians)} splats after {config.steps} steps in {result.seconds:.0f} s: {options.out / 'scene.ply'}")
+
+
+def _config(options: argparse.Namespace, path: Path | None) -> FitConfig:
+    """What the options say, on top of what the file says."""
+    given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FitConfig) if hasattr(options, item.name)}
+    return FitConfig(**given) if path is None else dataclasses.replace(read_config(path), **given)
+
+
+def _eval(options: argparse.Namespace) -> None:
+    beside = options.scene.with_name("config.json")
+    config = _config(options, beside if beside.is_file() else None)
+    gaussians = Gaussians.load(options.scene).to(_device(options.device))
+    capture = load_capture(options.data, downscale=config.downscale, test_every=config.test_every)
+    if not capture.test:
+        raise ValueError(f"{options.data}: expected held-out photos; there are none with test_every = {config.test_every}")
+    qualities = evaluate(gaussians, capture, capture.test, config)
+    for name, quality in qualities.items():
+        print(f"{name}: PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}")
+    _print_mean(qualities)
+    if options.out is not None:
+        write_json(options.out, metrics_of(qualities))
+
+
+def _print_mean(qualities: dict[str, Quality]) -> None:
+    mean = mean_quality(qualities)
+    if mean is not None:
+        print(f"{len(qualities)} held-out photos: PSNR {mean.psnr:.2f} dB, SSIM {mean.ssim:.4f}")
 
 
 def _render(options: argparse.Namespace) -> None:
@@ -189,9 +253,17 @@ def _framing_cameras(means: Tensor, count: int, up: tuple[float, ...], size: tup
     return cameras
 
 
+def _convert(options: argparse.Namespace) -> None:
+    out: Path = options.out
+    gaussians = Gaussians.load(options.scene)
+    out.parent.mkdir(parents=True, exist_ok=True)
+    gaussians.save(out)
+    print(f"{len(gaussians)} splats: {out} ({out.stat().st_size} bytes)")
+
+
 def _info(options: argparse.Namespace) -> None:
     path: Path = options.path
-    if path.is_dir() or path.suffix.lower() == ".json":
+    if (path.is_dir() or path.suffix.lower() == ".json") and not is_sog(path):
         _print_capture(path)
     else:
         _print_scene(path)
@@ -199,6 +271,7 @@ def _info(options: argparse.Namespace) -> None:
 
 def _print_scene(path: Path) -> None:
     gaussians = Gaussians.load(path)
+    print(f"format   {find_format(path).name}")
     print(f"splats   {len(gaussians)}, spherical harmonics of degree {gaussians.sh_degree}")
     finite = torch.stack([p.detach().flatten(1).isfinite().all(1) if p.ndim > 1 else p.isfinite() for p in gaussians.parameters()])
     good = finite.all(0)

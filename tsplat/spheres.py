@@ -112,10 +112,10 @@ def render_spheres(positions: Tensor, features: Tensor, radii: Tensor, camera: C
     ids = cutoff = None
     if n_track:
         ids = ops.nearest_hits(centers, R, Ks, *bins, n_track + tracked_only, width, height, tile, model, near, far, chord)
-        if tracked_only:                                # between the last hit that is tracked and the first that is not
+        if tracked_only:                                # half way to the next hit: D of a grazing ray, computed twice, is not quite the same
             last, _ = hit_weights(centers.detach(), R.detach(), o.detach(), g.detach(), Ks.detach(), centers.new_zeros(C, height, width),
                                   ids[..., -2:], model, near, far, chord)
-            cutoff, ids = last.mean(-1), ids[..., :-1]
+            cutoff, ids = last.mean(-1), ids[..., :-1].contiguous()
     images = ops.blend_spheres(centers, R, o, f, backgrounds, g, Ks, *bins, cutoff, width, height, tile, model, near, far, background_depth,
                                chord, depth is not None, percent_allowed_difference)
     alpha = -torch.expm1(background_depth / g - images.logsumexp)

@@ -22,6 +22,7 @@ ROOT = Path(__file__).resolve().parents[2]
 PICTURES = ROOT / "bench" / "pictures"
 SLOWEST = 0.1
 """Part of the learning rates that the last step of a stage has."""
+LAST_ROUND = 0.1
 
 
 def arguments(doc: str | None, picture: str, **options: float) -> argparse.ArgumentParser:
@@ -189,14 +190,16 @@ def optimise(groups: list[dict[str, object]], views: Views, loss: Callable[[View
 def optimise_and_relocate(spheres: Spheres, views: Views, loss: Callable[[Spheres, Views, float], Tensor],
                           alive: Callable[[Spheres], Tensor], *, rounds: int, steps: int, size: float, speed: float, batch: int,
                           gamma: tuple[float, float], generator: torch.Generator, name: str) -> Spheres:
-    """`optimise` in rounds, of `steps` in all; between these, spheres that are not alive go where others are."""
+    """`optimise` in rounds, of `steps` in all; between these, spheres that are not alive go where others are. From the first round to the last,
+    learning rates fall to `LAST_ROUND`: the shape comes first, its outline last."""
     fall = (gamma[1] / gamma[0]) ** (1 / rounds)
     for i in range(rounds):
         if i:
             spheres = spheres.relocated(alive(spheres), generator)
         ends = gamma[0] * fall**i, gamma[0] * fall ** (i + 1)
-        optimise(spheres.groups(size, speed), views, partial(loss, spheres), steps=max(1, steps // rounds), batch=batch, gamma=ends,
-                 generator=generator, name=f"{name} {i + 1}/{rounds}")
+        groups = spheres.groups(size, speed * LAST_ROUND ** (i / max(1, rounds - 1)))
+        optimise(groups, views, partial(loss, spheres), steps=max(1, steps // rounds), batch=batch, gamma=ends, generator=generator,
+                 name=f"{name} {i + 1}/{rounds}")
     return spheres
 
 

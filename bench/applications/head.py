@@ -33,7 +33,7 @@ def load(data: Path, downscale: float) -> tuple[Views, Views]:
 
 def main(argv: list[str] | None = None) -> Result:
     """Reconstruct, print and draw."""
-    parser = arguments(__doc__, "head.png", steps=300, batch=2, volume=8000, refinements=2, downscale=2.0, reach=1.0)
+    parser = arguments(__doc__, "head.png", steps=200, batch=1, volume=4000, refinements=2, downscale=2.0, reach=1.0)
     parser.add_argument("--spheres", type=Path, default=ROOT / "out" / "head.pt", help="a file for the spheres (default: out/head.pt)")
     args = parser.parse_args(argv)
     start, generator = time.process_time(), torch.Generator().manual_seed(args.seed)

@@ -25,7 +25,7 @@ import tsplat
 from tsplat.fit.spheres import visibility
 
 DISTANCE, FOV = 3.0, 42.0
-GAMMA = 0.5, 5e-3
+GAMMA = 0.5, 2e-2
 SHARP = 2e-3                # gamma of the targets
 LIGHTS = normalize(torch.tensor([[1.0, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]]), dim=1)
 COLORS = torch.tensor([[0.8, 0.1, 0.1], [0.1, 0.8, 0.1], [0.1, 0.1, 0.8], [0.4, 0.4, 0.4]])
@@ -97,7 +97,7 @@ def with_alpha(normals: Tensor) -> Tensor:
 
 def main(argv: list[str] | None = None) -> tuple[float, float]:
     """Optimise, print and draw."""
-    parser = arguments(__doc__, "illumination.png", steps=300, rounds=4, batch=4, spheres=3000, samples=20_000, cameras=144, size=128)
+    parser = arguments(__doc__, "illumination.png", steps=240, rounds=4, batch=4, spheres=3000, samples=20_000, cameras=144, size=128)
     parser.add_argument("--mesh", default="cow.obj", help="a file of triangles in the data's folder `meshes`")
     args = parser.parse_args(argv)
     start, generator = time.process_time(), torch.Generator().manual_seed(args.seed)

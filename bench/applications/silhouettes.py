@@ -24,7 +24,7 @@ HOLD_OUT = 8
 SEGMENTS = 15
 RADIUS = 1.0                # of a ball around the airplane
 LEAST_RADIUS = 0.006        # a quarter of a pixel
-GAMMA = 1.0, 0.3
+GAMMA = 1.0, 0.5
 """Soft, so that spheres in the wrong place are not hidden by others: that is how they learn to leave."""
 
 
@@ -54,7 +54,7 @@ def iou(image: Tensor, target: Tensor) -> float:
 
 def main(argv: list[str] | None = None) -> float:
     """Optimise, print and draw."""
-    parser = arguments(__doc__, "silhouettes.png", steps=1000, rounds=6, batch=4, segments=SEGMENTS)
+    parser = arguments(__doc__, "silhouettes.png", steps=1200, rounds=6, batch=4, segments=SEGMENTS)
     args = parser.parse_args(argv)
     start, generator = time.process_time(), torch.Generator().manual_seed(args.seed)
     views = load(args.data / "softras_airplane" / "softras_airplane.npz")

@@ -58,7 +58,7 @@ class Plain(nn.Module):
 
 def main(argv: list[str] | None = None) -> tuple[float, float]:
     """Reconstruct, go on in both ways, print and draw."""
-    parser = arguments(__doc__, "view_dependent.png", steps=300, batch=2, volume=8000, refinements=1, downscale=4.0, reach=1.0)
+    parser = arguments(__doc__, "view_dependent.png", steps=200, batch=1, volume=4000, refinements=1, downscale=4.0, reach=1.0)
     args = parser.parse_args(argv)
     start, generator = time.process_time(), torch.Generator().manual_seed(args.seed)
     torch.manual_seed(args.seed)                                                            # of the network's weights

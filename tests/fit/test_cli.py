@@ -73,6 +73,23 @@ def test_fit_from_the_outside_is_interrupted_and_goes_on(capture_folder: Path, t
     assert "Traceback" not in error
 
 
+def test_config_of_a_fit_makes_it_again_and_eval_measures_it(capture_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("fit", capture_folder, "-o", tmp_path / "a", "--test-every", 4, "--background", "white", "--no-antialiased", *SHORT) == 0
+    first = json.loads((tmp_path / "a" / "metrics.json").read_text())
+    assert run("fit", capture_folder, "-o", tmp_path / "b", "--config", tmp_path / "a" / "config.json", "--quiet") == 0
+    assert (tmp_path / "a" / "scene.ply").read_bytes() == (tmp_path / "b" / "scene.ply").read_bytes()
+    assert run("fit", capture_folder, "-o", tmp_path / "c", "--config", tmp_path / "a" / "config.json", "--quiet", "--steps", 2) == 0
+    again = json.loads((tmp_path / "c" / "config.json").read_text())["config"]
+    assert again == {**first["config"], "steps": 2}
+    capsys.readouterr()
+    assert run("eval", tmp_path / "a" / "scene.ply", capture_folder, "-o", tmp_path / "again.json") == 0
+    measured = json.loads((tmp_path / "again.json").read_text())
+    assert measured == {key: first[key] for key in ("ssim", "mean", "images")}
+    assert f"2 held-out photos: PSNR {first['mean']['psnr']:.2f} dB" in capsys.readouterr().out
+    assert run("eval", tmp_path / "a" / "scene.ply", capture_folder, "--test-every", 2) == 0
+    assert "4 held-out photos" in capsys.readouterr().out
+
+
 def test_render_camera(scene: Path, capture_folder: Path, tmp_path: Path) -> None:
     picture = tmp_path / "new" / "view.png"
     assert run("render", scene, "--camera", capture_folder, "--index", 3, "-o", picture) == 0
@@ -133,6 +150,9 @@ def test_info_capture(capture_folder: Path, capsys: pytest.CaptureFixture[str]) 
     (["fit", "{capture}", "-o", "{scene}"], "cloud.ply: expected a folder to write to"),
     (["fit", "{capture}", "-o", "{tmp}/out", "--steps", "-5"], "steps: expected"),
     (["fit", "{capture}", "-o", "{tmp}/out", "--device", "toaster"], "--device: expected"),
+    (["fit", "{capture}", "-o", "{tmp}/out", "--primitive", "spheres"], "primitive: 'spheres' cannot be fitted yet"),
+    (["fit", "{capture}", "-o", "{tmp}/out", "--config", "{scene}"], "cloud.ply: expected a config.json"),
+    (["eval", "{scene}", "{capture}", "--test-every", "0"], "expected held-out photos; there are none with test_every = 0"),
     (["render", "{tmp}/none.ply", "-o", "{tmp}/a.png"], "none.ply: No such file"),
     (["render", "{tmp}/cut.ply", "-o", "{tmp}/a.png"], "cut.ply: truncated"),
     (["render", "{scene}", "-o", "{tmp}/a.jpg", "--size", "8x6"], "ends in .png"),

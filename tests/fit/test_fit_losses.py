@@ -7,7 +7,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d
 
-from tsplat.fit.losses import Target, photo_loss, psnr, ssim, ssim_map, target_of
+from tsplat.fit.losses import Target, depth_loss, photo_loss, psnr, scene_regulariser, ssim, ssim_map, target_of
+from tsplat.rasterize import Meta
 
 
 def images(height: int, width: int) -> tuple[Tensor, Tensor]:
@@ -91,3 +92,44 @@ def test_alpha_shows_the_background() -> None:
     assert target.mask is None
     torch.testing.assert_close(target.image, b * alpha + background * (1 - alpha))
     assert torch.equal(target_of(b, background, masked=True).image, b)
+
+
+def test_reduced_target_is_the_mean_of_areas() -> None:
+    a, _ = images(8, 12)
+    blocks = a.view(4, 2, 6, 2, 3)
+    torch.testing.assert_close(Target(a).resized(6, 4).image, blocks.mean((1, 3)))
+    mask = (a[..., :1] > 0.5).float()
+    small = Target(a, mask).resized(6, 4)
+    assert small.mask is not None
+    weights = mask.view(4, 2, 6, 2, 1)
+    torch.testing.assert_close(small.mask, weights.mean((1, 3)))
+    counted = weights.sum((1, 3)).expand(-1, -1, 3) > 0
+    expected = (blocks * weights).sum((1, 3)) / weights.sum((1, 3))
+    torch.testing.assert_close(small.image[counted], expected[counted])
+
+
+def test_depth_loss_is_relative_and_skips_the_unknown() -> None:
+    truth = torch.tensor([[2.0, 4.0, 0.0], [float("nan"), float("inf"), 8.0]])
+    alpha = torch.tensor([[1.0, 0.5, 1.0], [1.0, 1.0, 0.0]])
+    depth = torch.tensor([[2.5, 1.0, 7.0], [7.0, 7.0, 0.0]], requires_grad=True)      # z = 2.5, 2, ...: off by 25 % and, half opaque, 50 %
+    loss = depth_loss(depth, alpha, truth)
+    assert float(loss.detach()) == pytest.approx((0.25 + 0.25 + 0) / 3)
+    loss.backward()
+    assert depth.grad is not None
+    torch.testing.assert_close(depth.grad, torch.tensor([[1 / 6, -1 / 12, 0], [0, 0, 0]]))
+    assert float(depth_loss(depth, alpha, torch.zeros(2, 3)).detach()) == 0
+
+
+def test_regularisers_are_their_formulas() -> None:
+    opacities, scales = torch.tensor([0.2, 0.6, 0.9]), torch.tensor([[1.0, 2, 3], [0, 0, 0], [6, 6, 6]])
+    radii, depths = torch.tensor([[[1, 1], [2, 2], [0, 0]]]), torch.tensor([[5.0, 10.0, -3.0]])
+    meta = Meta(radii, torch.zeros(1, 3, 2), depths, torch.zeros(2, dtype=torch.int64), (1, 1))
+
+    def value(**weights: float) -> Tensor | None:
+        return scene_regulariser(opacities, scales, meta, 2.0, **{"opacity": 0.0, "scale": 0.0, "opacity_depth": 0.0, **weights})
+
+    assert value() is None
+    assert float(value(opacity=0.1) or 0) == pytest.approx(0.1 * 1.7 / 3)
+    assert float(value(scale=0.1) or 0) == pytest.approx(0.1 * 24 / 9)
+    assert float(value(opacity_depth=0.1) or 0) == pytest.approx(-0.1 * (1 + 6) / 2 / 2)      # over the visible
+    assert float(value(opacity=1.0, scale=1.0) or 0) == pytest.approx(1.7 / 3 + 24 / 9)

@@ -2,15 +2,19 @@
 
 import os
 import resource
+import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
 
+import tsplat.fit.trainer
 from tsplat.fit import FitConfig, Step, fit
+from tsplat.fit.photos import PhotoParameters
 from tsplat.scene import Capture
 
 Make = Callable[..., FitConfig]
@@ -115,3 +119,82 @@ def test_files_of_others_stay(capture: Capture, config: Make, tmp_path: Path) ->
     assert (tmp_path / "scene.ply").read_bytes() == scene
     with pytest.raises(FileExistsError, match=r"notes\.txt: expected a folder"):
         fit(capture, config(steps=2), tmp_path / "notes.txt", progress=False)
+
+
+@pytest.mark.parametrize("changes", [
+    {"max_splats": 300},
+    {"density": "adaptive", "density_threshold": 1e-5, "reset_every": 9000, "max_splats": 400},
+    {"density": "mcmc", "max_splats": 250, "optimiser": "visible"},
+    {"refine_poses": True, "exposure": True, "resolution_warmup": 0.6, "opacity_depth_reg": 0.01, "background": "random", "pose_steps": 2},
+])
+def test_everything_resumes_bit_equal(capture: Capture, config: Make, tmp_path: Path, changes: dict[str, Any]) -> None:
+    """Stopped after step 7: amid a round of density control, and between two checkpoints."""
+    def press(step: Step) -> None:
+        if step.number == 7:
+            os.kill(os.getpid(), signal.SIGINT)
+
+    c = config(density_start=0.1, density_every=4, **{"density_stop": 0.9, **changes})
+    with pytest.raises(KeyboardInterrupt):
+        fit(capture, c, tmp_path / "stopped", progress=False, callbacks=[press])
+    resumed = fit(capture, c, tmp_path / "stopped", progress=False)
+    straight = fit(capture, c, tmp_path / "whole", progress=False)
+    assert (tmp_path / "stopped" / "scene.ply").read_bytes() == (tmp_path / "whole" / "scene.ply").read_bytes()
+    assert (resumed.qualities, resumed.refined) == (straight.qualities, straight.refined)
+    saved = [torch.load(tmp_path / name / "checkpoint.pt", weights_only=True)["state"] for name in ("stopped", "whole")]
+    for state in saved:
+        del state["seconds"]
+    assert flat(saved[0]) == flat(saved[1])
+
+
+def flat(state: Any) -> Any:
+    """The same, with the bytes of tensors instead of tensors, which == takes."""
+    if isinstance(state, dict):
+        return {key: flat(value) for key, value in state.items()}
+    if isinstance(state, list | tuple):
+        return [flat(value) for value in state]
+    return (state.shape, state.dtype, state.numpy().tobytes()) if isinstance(state, torch.Tensor) else state
+
+
+def test_nothing_is_saved_right_after_a_reset(capture: Capture, config: Make, tmp_path: Path) -> None:
+    """Resets after steps 6 and 12, then 1 step of unrest: the checkpoints due at 6, 7 and 12 are written after steps 5 and 11."""
+    c = config(steps=14, density="adaptive", density_stop=1.0, reset_every=6 * 30_000 // 14, checkpoint_every=1)
+    saved = []
+
+    def look(step: Step) -> None:
+        if (tmp_path / "checkpoint.pt").exists():
+            saved.append(torch.load(tmp_path / "checkpoint.pt", weights_only=True)["state"]["step"])
+
+    fit(capture, c, tmp_path, progress=False, callbacks=[look])
+    assert saved == [1, 2, 3, 4, 5, 5, 7, 8, 9, 10, 11, 11, 13]
+
+
+def test_parameter_of_a_photo_that_is_not_finite(capture: Capture, config: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    expose = PhotoParameters.expose
+
+    def spoilt(self: PhotoParameters, image: torch.Tensor, photo: int) -> torch.Tensor:
+        assert self.exposures is not None
+        self.exposures.register_hook(lambda gradient: gradient * float("nan"))
+        return expose(self, image, photo)
+
+    monkeypatch.setattr(PhotoParameters, "expose", spoilt)
+    with pytest.raises(FloatingPointError, match=r"step 1, photo view_00\d\.png: the gradient of exposures is not finite"):
+        fit(capture, config(exposure=True), progress=False)
+
+
+def test_failing_before_the_first_checkpoint_writes_one(capture: Capture, config: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of before the step that failed, to the last random number: what goes on from it ends as if nothing had been."""
+    loss, calls = tsplat.fit.trainer.photo_loss, []
+
+    def spoilt(*args: Any) -> torch.Tensor:
+        calls.append(1)
+        return loss(*args) * (float("inf") if len(calls) == 4 else 1.0)
+
+    c = config(background="random")
+    monkeypatch.setattr(tsplat.fit.trainer, "photo_loss", spoilt)
+    with pytest.raises(FloatingPointError, match="step 4, photo"):
+        fit(capture, c, tmp_path / "failed", progress=False)
+    steps: list[Step] = []
+    fit(capture, c, tmp_path / "failed", progress=False, callbacks=[steps.append])
+    assert steps[0].number == 4
+    fit(capture, c, tmp_path / "whole", progress=False)
+    assert (tmp_path / "failed" / "scene.ply").read_bytes() == (tmp_path / "whole" / "scene.ply").read_bytes()

@@ -13,6 +13,7 @@ import torch
 import tsplat.fit.trainer
 from tsplat.fit import FitConfig, Step, fit
 from tsplat.fit.losses import SSIM_NAME
+from tsplat.fit.output import read_config
 from tsplat.scene import Capture, Gaussians, load_capture, read_image, write_image, write_synthetic_capture
 
 Make = Callable[..., FitConfig]
@@ -44,11 +45,12 @@ def test_what_is_written(capture_folder: Path, config: Make, tmp_path: Path) -> 
     out = tmp_path / "new" / "out"
     c = config(steps=6)
     result = fit(capture_folder, c, out, progress=False)
-    assert sorted(path.name for path in out.iterdir()) == ["checkpoint.pt", "metrics.json", "scene.ply", "test"]
+    assert sorted(path.name for path in out.iterdir()) == [
+        "checkpoint.pt", "config.json", "contact.png", "curves.png", "metrics.json", "scene.ply", "test"]
     assert torch.equal(Gaussians.load(out / "scene.ply").means, result.gaussians.means)
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["ssim"] == SSIM_NAME
-    assert FitConfig(**metrics["config"]) == c
+    assert FitConfig(**metrics["config"]) == read_config(out / "config.json") == c
     assert set(metrics["images"]) == {"view_000.png", "view_004.png"}
     for measure in ("psnr", "ssim"):
         values = [image[measure] for image in metrics["images"].values()]

@@ -123,7 +123,7 @@ def test_refusals(tmp_path: Path) -> None:
     write_columns(path, good)
     whole = path.read_bytes()
     path.write_bytes(whole[:-5])
-    refused(f"truncated: expected {len(whole)} bytes for 2 vertices; found {len(whole) - 5}")
+    refused(f"truncated: expected {len(whole)} bytes for 2 rows of `vertex`; found {len(whole) - 5}")
     path.write_bytes(whole.replace(b"binary_little_endian", b"binary_big_endian"))
     refused("expected a binary_little_endian .ply of Gaussians; got binary_big_endian")
     path.write_bytes(whole.replace(b"binary_little_endian", b"ascii"))

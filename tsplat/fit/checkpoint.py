@@ -15,7 +15,7 @@ from tsplat.fit.state import FitState
 from tsplat.scene import Capture
 from tsplat.scene.files import replacing
 
-FORMAT = "tsplat fit 1"
+FORMAT = "tsplat fit 2"
 
 
 def save_checkpoint(path: Path, state: FitState, config: FitConfig, capture: Capture) -> None:
@@ -48,7 +48,7 @@ def restore(path: Path, saved: dict[str, Any], config: FitConfig, capture: Captu
     if saved["photos"] != _photos(capture):
         raise ValueError(f"{path}: made from other photos, or ones of another size; start afresh (resume=False), or choose "
                          "another folder")
-    return FitState.from_state_dict(saved["state"], device)
+    return FitState.from_state_dict(saved["state"], capture, config, device)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

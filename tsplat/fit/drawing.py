@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
 from tsplat.camera import Camera
 from tsplat.fit.config import FitConfig
-from tsplat.rasterize import Rendering, rasterize
+from tsplat.rasterize import DepthMode, Rendering, rasterize
 from tsplat.scene import Gaussians
 
 
 def draw(gaussians: Gaussians, camera: Camera, background: Tensor | None = None, *, sh_degree: int | None = None,
-         antialiased: bool = False) -> Rendering:
+         antialiased: bool = False, depth: DepthMode | None = None, probes: Mapping[str, Tensor] | None = None) -> Rendering:
     """Render with the bands of spherical harmonics up to `sh_degree` (default: all). Bands not drawn get no gradient at all.
 
     Args:
         camera: one or a batch.
         background: `[3]`, default black.
-        antialiased: see `rasterize`.
+        antialiased, depth: see `rasterize`.
+        probes: `screen_offset` or `absgrad` of `rasterize`, for density control.
     """
+    probes = probes or {}
     degree = gaussians.sh_degree if sh_degree is None else sh_degree
     rest = (degree + 1) ** 2 - 1
     sh = torch.cat([gaussians.sh0, gaussians.sh_rest[:, :rest]], dim=1) if rest else gaussians.sh0
     return rasterize(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, sh, camera, sh_degree=degree,
-                     background=background, antialiased=antialiased)
+                     background=background, antialiased=antialiased, depth=depth,
+                     screen_offset=probes.get("screen_offset"), absgrad=probes.get("absgrad"))
 
 
 def fixed_background(config: FitConfig) -> Tensor:

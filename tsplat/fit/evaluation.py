@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
+from torch import Tensor
 
+from tsplat.camera import Camera
 from tsplat.fit.config import FitConfig
-from tsplat.fit.drawing import draw, fixed_background
-from tsplat.fit.losses import psnr, ssim, target_of
-from tsplat.scene import Capture, Gaussians, write_image
+from tsplat.fit.drawing import fixed_background
+from tsplat.fit.losses import Target, photo_loss, psnr, ssim, target_of
+from tsplat.fit.pose import refined
+from tsplat.fit.primitive import Scene, primitive_of
+from tsplat.fit.schedules import rate_factor
+from tsplat.scene import Capture, write_image
 
 
 class Quality(NamedTuple):
@@ -22,12 +27,13 @@ class Quality(NamedTuple):
 
 
 @torch.no_grad()
-def evaluate(gaussians: Gaussians, capture: Capture, views: Sequence[int], config: FitConfig, pictures: Path | None = None
-             ) -> dict[str, Quality]:
+def evaluate(gaussians: Scene, capture: Capture, views: Sequence[int], config: FitConfig, pictures: Path | None = None,
+             cameras: Mapping[int, Camera] | None = None) -> dict[str, Quality]:
     """Compare renders, clamped to 0..1, with photos `views` of a capture.
 
     Args:
-        config: `background` and `antialiased` of it are used.
+        config: `primitive`, `background` and `antialiased` of it are used.
+        cameras: by view, instead of the capture's (see `refined_cameras`).
         pictures: an existing folder for one PNG per photo: the photo on the left, the render on the right.
 
     Returns:
@@ -35,14 +41,37 @@ def evaluate(gaussians: Gaussians, capture: Capture, views: Sequence[int], confi
     """
     device = gaussians.means.device
     background = fixed_background(config).to(device)
-    qualities = {}
+    primitive, qualities = primitive_of(config), {}
     for view in views:
         target = target_of(capture.images[view].to(device), background, masked=capture.masked)
-        image = draw(gaussians, capture.camera(view).to(device), background, antialiased=config.antialiased).image.clamp(0, 1)
+        camera = (capture.camera(view) if cameras is None else cameras[view]).to(device)
+        image = primitive.draw(gaussians, camera, background, config).image.clamp(0, 1)
         qualities[capture.names[view]] = Quality(float(psnr(image, target)), float(ssim(image, target)))
         if pictures is not None:
             write_image(pictures / picture_name(capture.names[view]), torch.cat([target.image, image], dim=1))
     return qualities
+
+
+def refined_cameras(gaussians: Scene, capture: Capture, views: Sequence[int], config: FitConfig) -> dict[int, Camera]:
+    """The cameras of photos `views`, with poses that suit the scene best as it is: their loss is minimised, the scene is frozen.
+
+    For fits that refine poses, where those of held-out photos would be left behind.
+    """
+    primitive, device = primitive_of(config), gaussians.means.device
+    background = fixed_background(config).to(device)
+    cameras = {}
+    gaussians.requires_grad_(False)
+    try:
+        for view in views:
+            target = target_of(capture.images[view].to(device), background, masked=capture.masked)
+
+            def loss(camera: Camera, target: Target = target) -> Tensor:
+                return photo_loss(primitive.draw(gaussians, camera, background, config).image, target, config.ssim_weight)
+
+            cameras[view] = refined(capture.camera(view).to(device), loss, capture.extent, config.pose_steps, config.lr_poses * rate_factor(config))
+    finally:
+        gaussians.requires_grad_(True)
+    return cameras
 
 
 def picture_name(photo: str) -> str:

@@ -18,17 +18,25 @@ def initial_gaussians(capture: Capture, config: FitConfig, generator: torch.Gene
     """Round Gaussians as in 3DGS (section 5.1): at the sparse points, in their colours, or random without points.
 
     With fewer points than `config.splats`, the cloud is filled up by `fill_up`. Without points, `config.splats` random
-    ones lie in the cube of `view_cube`.
+    ones lie in the cube of `view_cube`. There are never more than `config.max_splats`, if that is given: of more points, some
+    at random.
     """
+    most = config.max_splats or math.inf
+    count = int(min(config.splats, most))
     if capture.points is None or not len(capture.points):
         low, high = view_cube(capture)
-        splats = Gaussians.random(config.splats, low, high, config.sh_degree, generator)
+        splats = Gaussians.random(count, low, high, config.sh_degree, generator)
     else:
-        points, colors = fill_up(capture.points, capture.point_colors, config.splats, generator)
+        points, colors = capture.points, capture.point_colors
+        if len(points) > most:
+            chosen = torch.randperm(len(points), generator=generator)[:config.max_splats]
+            points, colors = points[chosen], None if colors is None else colors[chosen]
+        points, colors = fill_up(points, colors, count, generator)
         splats = Gaussians.from_points(points, colors, config.sh_degree)
     with torch.no_grad():
-        splats.opacity_logits.fill_(math.log(config.init_opacity / (1 - config.init_opacity)))
-        splats.log_scales.add_(math.log(config.init_scale))
+        opacity = config.published("init_opacity")
+        splats.opacity_logits.fill_(math.log(opacity / (1 - opacity)))
+        splats.log_scales.add_(math.log(config.published("init_scale")))
     return splats
 
 

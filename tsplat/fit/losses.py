@@ -1,4 +1,4 @@
-"""What is minimised and what is measured: L1, SSIM and PSNR of a render against a photo.
+"""What is minimised and what is measured: L1, SSIM and PSNR of a render against a photo, depth, and regularisers.
 
 SSIM (Wang et al. 2004) is that of kornia: an 11x11 Gaussian window of sigma 1.5, per channel. Images are padded with zeros, as
 the 3DGS code does, so that figures compare with its and images of any size have one.
@@ -10,7 +10,9 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d
+from torch.nn.functional import conv2d, interpolate
+
+from tsplat.rasterize import Meta
 
 WINDOW = 11
 SIGMA = 1.5
@@ -35,6 +37,13 @@ class Target(NamedTuple):
             return values.mean()
         return (values * self.mask).sum() / (self.mask.sum() * values.shape[-1]).clamp(min=1)
 
+    def resized(self, width: int, height: int) -> Target:
+        """Reduced by averaging areas, of what counts in them."""
+        if self.mask is None:
+            return Target(_reduced(self.image, width, height))
+        mask = _reduced(self.mask, width, height)
+        return Target(_reduced(self.image * self.mask, width, height) / mask.clamp(min=1e-6), mask)
+
 
 def target_of(photo: Tensor, background: Tensor, *, masked: bool) -> Target:
     """The target that a photo `[H, W, 3 or 4]` gives; its fourth channel is a mask if `masked`, else its alpha."""
@@ -48,6 +57,43 @@ def photo_loss(image: Tensor, target: Target, ssim_weight: float) -> Tensor:
     """(1 - w) L1 + w (1 - SSIM) (3DGS, equation 7) of `[H, W, 3]`: a scalar. Pixels that do not count get no gradient."""
     loss = (1 - ssim_weight) * target.average((image - target.image).abs())
     return loss + ssim_weight * (1 - ssim(image, target)) if ssim_weight else loss
+
+
+def depth_loss(depth: Tensor, alpha: Tensor, truth: Tensor) -> Tensor:
+    """Mean over pixels of known depth of |sum of w_i (z_i / z - 1)|, a relative error to which only what is opaque counts.
+
+    Args:
+        depth: `[H, W]`, accumulated: the sum of the splats' weights times camera z.
+        alpha: `[H, W]`, the sum of the weights.
+        truth: `[H, W]` camera z; unknown where not finite or not above 0.
+    """
+    known = truth.isfinite() & (truth > 0)
+    error = depth / truth.where(known, 1.0) - alpha
+    return (error.abs() * known).sum() / known.sum().clamp(min=1)
+
+
+def scene_regulariser(opacities: Tensor, scales: Tensor, meta: Meta, extent: float, *, opacity: float, scale: float,
+                      opacity_depth: float) -> Tensor | None:
+    """The weighted sum of what the loss has besides the photo, or None without any weight.
+
+    Args:
+        opacities, scales: `[N]` and `[N, 3]`.
+        meta: of the rendering: depths, and what is visible.
+        extent: unit of depth.
+        opacity, scale: weights of the means of both, as in 3DGS-MCMC (Kheradmand et al. 2024, equation 10).
+        opacity_depth: weight of minus the mean of o z over what is visible (Pulsar, Lassner and Zollhoefer 2021): what is near
+            and opaque has to be worth it, which keeps floaters from the cameras.
+    """
+    terms = []
+    if opacity and len(opacities):
+        terms.append(opacity * opacities.mean())
+    if scale and len(scales):
+        terms.append(scale * scales.mean())
+    if opacity_depth:
+        visible = meta.visible
+        seen = (opacities * meta.depths).where(visible, 0.0).sum() / visible.sum().clamp(min=1)
+        terms.append(-opacity_depth * seen / extent)
+    return sum(terms[1:], terms[0]) if terms else None
 
 
 def psnr(image: Tensor, target: Target) -> Tensor:
@@ -81,3 +127,9 @@ def _blurred(planes: Tensor) -> Tensor:
     window = torch.softmax(-offsets.square() / (2 * SIGMA**2), 0).expand(planes.shape[1], 1, 1, -1)
     planes = conv2d(planes, window.mT, padding=(WINDOW // 2, 0), groups=planes.shape[1])
     return conv2d(planes, window, padding=(0, WINDOW // 2), groups=planes.shape[1])
+
+
+def _reduced(image: Tensor, width: int, height: int) -> Tensor:
+    """`[H, W, C]` to `[height, width, C]`, by averaging areas."""
+    small: Tensor = interpolate(image.permute(2, 0, 1)[None], size=(height, width), mode="area")[0]
+    return small.permute(1, 2, 0)

@@ -1,4 +1,4 @@
-"""`fit`: from posed photos to Gaussians (3DGS, sections 5.1 and 7.1, without density control)."""
+"""`fit`: from posed photos to a scene (3DGS, sections 5 and 7.1). What it is made of, `primitive` knows."""
 
 from __future__ import annotations
 
@@ -6,23 +6,30 @@ import math
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from torch import nn
 
+from tsplat.camera import Camera
 from tsplat.fit.checkpoint import restore, save_checkpoint
 from tsplat.fit.config import FitConfig
-from tsplat.fit.drawing import draw, step_background
-from tsplat.fit.evaluation import Quality, evaluate, mean_quality
-from tsplat.fit.initial import initial_gaussians
+from tsplat.fit.drawing import step_background
+from tsplat.fit.evaluation import Quality, evaluate, mean_quality, picture_name, refined_cameras
 from tsplat.fit.interrupt import deferred_interrupt
-from tsplat.fit.losses import photo_loss, psnr, target_of
-from tsplat.fit.optimiser import learning_rates, make_adam, set_rates, sh_degree_at
+from tsplat.fit.losses import Target, depth_loss, photo_loss, psnr, target_of
+from tsplat.fit.memory import check_growth
+from tsplat.fit.optimiser import adam_step, set_rates
 from tsplat.fit.output import Output
+from tsplat.fit.primitive import Scene, primitive_of
 from tsplat.fit.progress import progress_line
+from tsplat.fit.report import write_sheet
+from tsplat.fit.schedules import divisor_at
 from tsplat.fit.state import FitState
-from tsplat.scene import Capture, Gaussians, load_capture
+from tsplat.fit.stream import PhotoStream
+from tsplat.fit.turntable import write_turntable
+from tsplat.scene import Capture, load_capture
 
 
 @dataclass(frozen=True)
@@ -40,7 +47,7 @@ class Step:
     photo: str
     loss: float
     psnr: float
-    gaussians: Gaussians
+    gaussians: Scene
 
 
 @dataclass(frozen=True)
@@ -50,11 +57,13 @@ class FitResult:
     Args:
         gaussians: the scene.
         qualities: PSNR and SSIM of the held-out photos, by name.
+        refined: the same with the poses of these photos refined, too, where the fit refined poses; else empty.
         seconds: wall time of the steps, also of those before an interruption.
     """
 
-    gaussians: Gaussians
+    gaussians: Scene
     qualities: dict[str, Quality]
+    refined: dict[str, Quality]
     seconds: float
 
     @property
@@ -62,28 +71,37 @@ class FitResult:
         """Mean quality, or None if no photo was held out."""
         return mean_quality(self.qualities)
 
+    @property
+    def refined_mean(self) -> Quality | None:
+        """Mean quality with refined poses, or None without."""
+        return mean_quality(self.refined)
+
 
 def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None, out: str | os.PathLike[str] | None = None, *,
         resume: bool = True, progress: bool = True, callbacks: Sequence[Callable[[Step], None]] = (),
         device: str | torch.device = "cpu") -> FitResult:
-    """Fit a scene to photos: one photo per step, at random without replacement, Adam on L1 and SSIM.
+    """Fit a scene to photos: one photo per step, at random without replacement, Adam on L1 and SSIM, density control.
 
     Args:
         data: a capture, or the folder of one (see `load_capture`; `downscale` and `test_every` of the config apply to a
             folder only).
         config: default `FitConfig()`.
-        out: a folder, made if need be, for `scene.ply`, `metrics.json`, `test/<photo>.png` (held-out photo beside
-            render) and `checkpoint.pt`. Other files in it are left alone. None: nothing is written.
+        out: a folder, made if need be, for `scene.ply`, `metrics.json`, `config.json`, `curves.png`, `test/<photo>.png` (held-out
+            photo beside render), `contact.png` (some of these, with the error), `turntable.gif` (if asked for) and
+            `checkpoint.pt`. Other files in it are left alone. None: nothing is written.
         resume: go on from the checkpoint in `out`, if there is one. A fit that was interrupted and resumed ends, on the same
             machine, with the same bits as one that was not.
         progress: show a line with loss, PSNR and number of splats.
-        callbacks: each is called after each step.
+        callbacks: each is called after each step; `tsplat.fit.to_writer` makes one for TensorBoard.
         device: where to compute.
 
     Raises:
         ValueError, FileNotFoundError: bad data, no photo to train on, a checkpoint of another fit.
         FileExistsError: `out` holds a file of one of these names that is not from a fit.
-        FloatingPointError: a loss or gradient that is not finite, naming the step and the photo. The last checkpoint stays.
+        FloatingPointError: a loss or gradient that is not finite, naming the step, the photo and the parameter. The last
+            checkpoint stays; if there is none yet, one is written.
+        MemoryError: density control would take more memory than is free; before it does. As above.
+        NotImplementedError: a primitive that cannot be fitted yet.
         OSError: a file cannot be written. The last checkpoint stays.
         KeyboardInterrupt: on Ctrl-C, after the step and a checkpoint; its message says where it is.
     """
@@ -106,59 +124,128 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
         save_checkpoint(output.checkpoint, state, config, capture)
         output.pictures.mkdir(exist_ok=True)
     qualities = evaluate(state.gaussians, capture, capture.test, config, None if output is None else output.pictures)
+    refined = {}
+    if config.refine_poses:
+        cameras = refined_cameras(state.gaussians, capture, capture.test, config)
+        refined = evaluate(state.gaussians, capture, capture.test, config, cameras=cameras)
     if output is not None:
-        output.write(state.gaussians, config, qualities, state.seconds)
-    return FitResult(state.gaussians, qualities, state.seconds)
+        output.write(state.gaussians, config, qualities, refined, state.seconds)
+        state.history.write(output.curves)
+        if qualities:
+            write_sheet(output.sheet, [output.pictures / picture_name(name) for name in qualities])
+        if config.video:
+            write_turntable(output.turntable, state.gaussians, capture, config, config.video)
+    return FitResult(state.gaussians, qualities, refined, state.seconds)
 
 
 def start(capture: Capture, config: FitConfig, device: torch.device) -> FitState:
     """The state before the first step."""
     generator = torch.Generator().manual_seed(config.seed)
-    gaussians = initial_gaussians(capture, config, generator).to(device)
-    return FitState(gaussians, make_adam(gaussians), generator)
+    scene = primitive_of(config).start(capture, config, generator).to(device)
+    return FitState.of(scene, capture, config, generator)
 
 
-def train_step(state: FitState, capture: Capture, config: FitConfig) -> Step:
-    """Render one photo's view, compare, and move the parameters. Nothing changes if it raises FloatingPointError."""
-    gaussians = state.gaussians
-    device = gaussians.means.device
+def train_step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStream | None = None) -> Step:
+    """Render one photo's view, compare, and move the parameters. Nothing changes if it raises.
+
+    Args:
+        state: of the fit.
+        capture, config: which it was started with.
+        images: to read the photos from, default those of the capture.
+
+    Raises:
+        FloatingPointError, MemoryError: see `fit`.
+    """
+    before = state.generator.get_state(), list(state.queue)
+    try:
+        return _step(state, capture, config, images)
+    except (FloatingPointError, MemoryError):
+        state.generator.set_state(before[0])
+        state.queue = before[1]
+        raise
+
+
+def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStream | None) -> Step:
+    scene, primitive, extent = state.gaussians, primitive_of(config), capture.extent
+    device = scene.means.device
     view = state.next_view(capture.train)
+    photo = (images or capture.images)[view].to(device)
+    if images is not None and state.queue:
+        images.prepare(state.queue[-1])
     background = step_background(config, state.generator).to(device)
-    target = target_of(capture.images[view].to(device), background, masked=capture.masked)
-    rendering = draw(gaussians, capture.camera(view).to(device), background, sh_degree=sh_degree_at(config, state.step),
-                     antialiased=config.antialiased)
-    loss = photo_loss(rendering.image, target, config.ssim_weight)
+    camera, target = _reduced(capture.camera(view).to(device), target_of(photo, background, masked=capture.masked),
+                              divisor_at(config, state.step))
+    camera = state.photos.camera(camera, view, extent)
+    truth = capture.depth(view, camera.width, camera.height) if config.depth_weight else None
+    probes = state.control.probes(scene, state.step + 1)
+    rendering = primitive.draw(scene, camera, background, config, state.step, depth=truth is not None, probes=probes)
+    loss = photo_loss(state.photos.expose(rendering.image, view), target, config.ssim_weight)
+    if truth is not None and rendering.depth is not None:
+        loss = loss + config.depth_weight * depth_loss(rendering.depth, rendering.alpha, truth.to(device))
+    regulariser = primitive.regulariser(scene, rendering, config, extent)
+    loss = loss if regulariser is None else loss + regulariser
     state.adam.zero_grad()
     loss.backward()                                       # type: ignore[no-untyped-call]
-    _check_finite(float(loss.detach()), gaussians, f"step {state.step + 1}, photo {capture.names[view]}")
-    set_rates(state.adam, learning_rates(config, capture.extent, state.step))
-    state.adam.step()
+    _check_finite(float(loss.detach()), [scene, state.photos], f"step {state.step + 1}, photo {capture.names[view]}")
+    state.control.observe(rendering.meta, camera)
+    check_growth(scene, state.control.growth(scene, state.step + 1), state.step + 1)
+    set_rates(state.adam, primitive.rates(config, extent, state.step))
+    adam_step(state.adam, rendering.meta.visible.any(0))
+    state.photos.step(view, config, state.step)
     state.step += 1
-    return Step(state.step, capture.names[view], float(loss.detach()), float(psnr(rendering.image.detach(), target)), gaussians)
+    quality = float(psnr(rendering.image.detach(), target))
+    state.control.update(scene, state.adam, state.step, state.generator)
+    return Step(state.step, capture.names[view], float(loss.detach()), quality, scene)
 
 
 def _train(state: FitState, capture: Capture, config: FitConfig, output: Output | None, progress: bool,
            callbacks: Sequence[Callable[[Step], None]]) -> None:
     """All steps that are left."""
-    before, begin = state.seconds, time.perf_counter()
-    with deferred_interrupt() as interrupt, progress_line(config.steps, state.step, shown=progress) as show:
+    before, begin, kept = state.seconds, time.perf_counter(), state.step > 0      # kept: whether there is a checkpoint of this fit
+    with (deferred_interrupt() as interrupt, progress_line(config.steps, state.step, shown=progress) as show,
+          PhotoStream(capture.images) as images):
         while state.step < config.steps:
-            step = train_step(state, capture, config)
+            try:
+                step = train_step(state, capture, config, images)
+            except (FloatingPointError, MemoryError):
+                if output is not None and not kept:
+                    save_checkpoint(output.checkpoint, state, config, capture)
+                raise
             show(step.loss, step.psnr, len(state.gaussians))
+            state.history.add(step.number, config.steps, step.loss, step.psnr, len(state.gaussians))
             for callback in callbacks:
                 callback(step)
             state.seconds = before + time.perf_counter() - begin
-            due = state.step % config.checkpoint_every == 0 and state.step < config.steps
-            if output is not None and (due or interrupt.requested):
+            if output is not None and (_due(state, config) or interrupt.requested):
                 save_checkpoint(output.checkpoint, state, config, capture)
+                kept = True
             if interrupt.requested:
                 raise KeyboardInterrupt(f"stopped after step {state.step} of {config.steps}" + (
                     "" if output is None else f"; the same call goes on from {output.checkpoint}"))
 
 
-def _check_finite(loss: float, gaussians: Gaussians, where: str) -> None:
+def _due(state: FitState, config: FitConfig) -> bool:
+    """Whether to write a checkpoint now: where one is due right after a reset of opacities, it is written before that instead."""
+    step = state.step
+    if not state.control.settled(step):
+        return False
+    following = next((s for s in range(step + 1, config.steps) if state.control.settled(s)), config.steps)
+    return step < config.steps and any(s % config.checkpoint_every == 0 for s in range(step, following))
+
+
+def _reduced(camera: Camera, target: Target, divisor: int) -> tuple[Camera, Target]:
+    """Both, at 1 / `divisor` of their size."""
+    if divisor == 1:
+        return camera, target
+    width, height = (max(1, round(side / divisor)) for side in (camera.width, camera.height))
+    scale = camera.Ks.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
+    return replace(camera, Ks=camera.Ks * scale, width=width, height=height), target.resized(width, height)
+
+
+def _check_finite(loss: float, modules: Sequence[nn.Module], where: str) -> None:
     if not math.isfinite(loss):
         raise FloatingPointError(f"{where}: the loss is {loss}; expected a finite number. The scene is as before this step")
-    for name, parameter in gaussians.named_parameters():
-        if parameter.grad is not None and not bool(parameter.grad.sum().isfinite()):
-            raise FloatingPointError(f"{where}: the gradient of {name} is not finite. The scene is as before this step")
+    for module in modules:
+        for name, parameter in module.named_parameters():
+            if parameter.grad is not None and not bool(parameter.grad.sum().isfinite()):
+                raise FloatingPointError(f"{where}: the gradient of {name} is not finite. The scene is as before this step")

@@ -106,7 +106,8 @@ def _splats(block: int, num_warps: int) -> dict[str, int]:
 
 # project, harmonics: a splat per thread, so that no thread repeats another's work. As few warps as can be where there are sums over the block:
 # one needs no step from warp to warp, and sums of more blocks to add up are a percent or two of what is read anyway. (project_backward in two
-# warps spills on sm_120.) pick: a count of BLOCK must fit a byte. blend: a warp takes 4 tiles (8 of 64 lanes). features: splats and channels
+# warps spills on sm_120.) pick: a count of BLOCK must fit a byte. blend: a warp takes 4 tiles (8 of 64 lanes). adam: BLOCK numbers of a
+# program, in whole rows: 8 a thread, in 16-byte loads. features: splats and channels
 # of a matrix product; in 4 warps the forward was faster on an H100, but spills on sm_120. All columns but NVIDIA's are untimed.
 LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "project": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
@@ -118,6 +119,7 @@ LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "records": {"nvidia": _splats(32, 1), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
     "blend": {family: {"num_warps": 1} for family in FAMILIES},
     "blend_backward": {family: {"num_warps": 1} for family in FAMILIES},
+    "adam": {"nvidia": _splats(1024, 4), "cdna": _splats(1024, 4), "rdna": _splats(1024, 4)},
     "features": {"nvidia": {"K": 16, "DB": 64, "num_warps": 8}, "cdna": {"K": 16, "DB": 32, "num_warps": 8},
                  "rdna": {"K": 16, "DB": 32, "num_warps": 8}},
     "features_colors_backward": {"nvidia": {"K": 16, "DB": 32, "num_warps": 4}, "cdna": {"K": 16, "DB": 32, "num_warps": 4},

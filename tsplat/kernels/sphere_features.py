@@ -160,7 +160,7 @@ def sphere_feature_bwd_kernel(records, features, ids, offsets, used, gamma, Ks, 
         if v_depth is not None:
             g += distance_in * v_z
         s0, s1, s2, s3, s4, s5, pixel_mx, pixel_my = term_gradients(
-            g, e, v_z, t, s, h, a, distance_in, mx, my, w, X, Y, depth, R, r, o, distance, -(o * depth1) * inv_gamma, inv_gamma, depth0, depth1,
+            g, e, v_z, t, s, h, a, distance_in, mx, my, w, w2, X, Y, depth, R, r, o, distance, -(o * depth1) * inv_gamma, inv_gamma, depth0, depth1,
             EPS, 0, ORTHO, CHORD, PTX)
         if v_rays is not None:
             v_mx += tl.sum(pixel_mx, 1, keep_dims=True)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from tsplat.kernels.footprint import SUMS, TILE, store4
 from tsplat.kernels.launch import Launcher, ceil_div, launch
-from tsplat.kernels.tiles import load4
+from tsplat.kernels.tiles import load4, row_dot
 
 CHANNELS = 4
 """Up to here a sphere's features are in its record and a pixel's in registers."""
@@ -53,6 +53,12 @@ def reciprocal(v, PTX: tl.constexpr):
 
 
 @triton.jit
+def product(mx, my, x, y, z):
+    """Vector product of centre and ray; what depends on my alone is computed once where a lane's pixels share a row."""
+    return z * mx - x, z * my - y, x * my - y * mx
+
+
+@triton.jit
 def enter(mx, my, w, w2, x, y, z, R, r, distance, ORTHO: tl.constexpr, CHORD: tl.constexpr, PTX: tl.constexpr):
     """t, s, h, a and D; t = s = 1 where the ray misses. `distance`, of the centre, is for `chord`."""
     if ORTHO:
@@ -61,12 +67,7 @@ def enter(mx, my, w, w2, x, y, z, R, r, distance, ORTHO: tl.constexpr, CHORD: tl
         t = py * py + px * px
         a = z
     else:
-        xr = x * r
-        yr = y * r
-        zr = z * r
-        py = zr * my - yr                               # what depends on my alone is computed once where a lane's pixels share a row
-        px = zr * mx - xr
-        pz = xr * my - yr * mx
+        px, py, pz = product(mx, my, x * r, y * r, z * r)
         t = (py * py + px * px + pz * pz) * w2
         a = ((y * my + z) + x * mx) * w
     t = tl.minimum(t, 1.0)
@@ -124,7 +125,16 @@ def total(v, AXIS: tl.constexpr):
 
 
 @triton.jit
-def term_gradients(g, e, v_depth, t, s, h, a, D, mx, my, w, x, y, z, R, r, o, distance, slope, inv_gamma, depth0, depth1,
+def dot(a, b, AXIS: tl.constexpr):
+    """Sum of a b over pixels."""
+    if AXIS == 1:
+        return row_dot(a, b)
+    else:
+        return tl.sum(a * b, AXIS, keep_dims=True)
+
+
+@triton.jit
+def term_gradients(g, e, v_depth, t, s, h, a, D, mx, my, w, w2, x, y, z, R, r, o, distance, slope, inv_gamma, depth0, depth1,
                    EPS: tl.constexpr, AXIS: tl.constexpr, ORTHO: tl.constexpr, CHORD: tl.constexpr, PTX: tl.constexpr):
     """Gradients of the centre (3), the radius, the opacity and gamma, summed over pixels; and of mx and my.
 
@@ -138,7 +148,7 @@ def term_gradients(g, e, v_depth, t, s, h, a, D, mx, my, w, x, y, z, R, r, o, di
     ge = g * e
     v_e = ge * d
     sum_e = total(v_e, AXIS)
-    sum_ez = (depth0 * sum_e - depth1 * total(v_e * D, AXIS)) * inv_gamma                   # z/gamma is depth0 - depth1 D, over gamma
+    sum_ez = (depth0 * sum_e - depth1 * dot(v_e, D, AXIS)) * inv_gamma                   # z/gamma is depth0 - depth1 D, over gamma
     v_o = sum_e + o * sum_ez
     v_gamma = -(o * o) * inv_gamma * sum_ez
     along = ge * slope                                                                      # dL/dD over o d
@@ -159,26 +169,43 @@ def term_gradients(g, e, v_depth, t, s, h, a, D, mx, my, w, x, y, z, R, r, o, di
         v_a -= v_ratio / distance
     else:
         v_t += v_s2
-    u = v_t * (2.0 * r * r)
-    v_R = -o * (total(v_D * h, AXIS) + R * total(u * t, AXIS))
+    v_R = -o * (dot(v_D, h, AXIS) + (2.0 * r) * dot(v_t, t, AXIS))
     if ORTHO:
+        u = v_t * (2.0 * r * r)
         v_mx = u * (mx - x)
         v_my = u * (my - y)
         v_x = -o * total(v_mx, AXIS)
         v_y = -o * total(v_my, AXIS)
         v_z = o * total(v_a, AXIS)
     else:
-        k = (v_a - u * a) * w                           # dt/dc = 2/R^2 (c - a w m), da/dc = w m
-        S = total(u, AXIS)
+        px, py, pz = product(mx, my, x * r, y * r, z * r)
+        u = v_t * (2.0 * w2)                            # dL/dp over p
+        k = v_a * w
+        ux = u * px
+        uz = u * pz
+        X = dot(k, mx, AXIS) - r * total(ux, AXIS)
+        Z = total(k, AXIS) + r * dot(ux, mx, AXIS)
+        Y = -r * dot(uz, mx, AXIS)
+        if AXIS == 1:                                   # a lane's pixels have one my, and so one py
+            v_py = py * total(u, AXIS)
+            X += r * my * total(uz, AXIS)
+            Y += my * total(k, AXIS) - r * v_py
+            Z += r * my * v_py
+        else:
+            X += r * dot(uz, my, AXIS)
+            Y += dot(k, my, AXIS) - r * dot(u, py, AXIS)
+            Z += r * dot(u * py, my, AXIS)
         if CHORD:
-            S += total(v_ratio * a, AXIS) / (distance * distance * distance)
-        K = total(k, AXIS)
-        v_x = o * (x * S + total(k * mx, AXIS))
-        v_y = o * (y * S + (my * K if AXIS == 1 else total(k * my, AXIS)))                  # a lane's pixels have one my
-        v_z = o * (z * S + K)
+            by_distance = dot(v_ratio, a, AXIS) / (distance * distance * distance)
+            X += by_distance * x
+            Y += by_distance * y
+            Z += by_distance * z
+        v_x = o * X
+        v_y = o * Y
+        v_z = o * Z
         aw = a * w
-        v_mx = k * (x - aw * mx)                        # dt/dm = -2/R^2 a/w (c - a w m), da/dm = w (c - a w m)
-        v_my = k * (y - aw * my)
+        v_mx = r * (z * ux - y * uz) - u * t * mx + k * (x - aw * mx)
+        v_my = r * (z * py * u + x * uz) - u * t * my + k * (y - aw * my)
     return v_x, v_y, v_z, v_R, v_o, v_gamma, o * v_mx, o * v_my
 
 

@@ -12,22 +12,22 @@ from tsplat.kernels.launch import Launcher, current_target, launch
 from tsplat.kernels.sphere_geometry import Spheres, enter, far_off, load_sphere, rays, reciprocal
 from tsplat.kernels.tiles import block_pixels, blocks, glue, lane_x, load_batch, of_batch, prefetch_records, tile_list, tile_min
 
-SLOTS = 8
-"""Hits that a pass over the spheres finds: as many as there are registers for."""
+SLOTS = 5
+"""Hits that a pass over the spheres finds: as many as all targets have registers for."""
 
 
 @triton.jit
 def insert(depths, places, depth, place):
     """Sorted lists, tuples of their first, second.., with one more hit each and without what is then last. Of equals the former stays first."""
+    new_depths = depths[:0]
+    new_places = places[:0]
     for j in tl.static_range(len(depths)):
         closer = depth < depths[j]
-        kept_depth = tl.where(closer, depth, depths[j])
-        kept_place = tl.where(closer, place, places[j])
+        new_depths += (tl.where(closer, depth, depths[j]),)
+        new_places += (tl.where(closer, place, places[j]),)
         depth = tl.where(closer, depths[j], depth)
         place = tl.where(closer, places[j], place)
-        depths = depths[:j] + (kept_depth,) + depths[j + 1:]
-        places = places[:j] + (kept_place,) + places[j + 1:]
-    return depths, places
+    return new_depths, new_places
 
 
 @Launcher
@@ -39,7 +39,7 @@ def nearest_kernel(records, ids, offsets, Ks, found, lane_x, W, H, tiles_x, tile
     view, tile, exists, left, top, x, y, column4, pixel4 = block_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
     dt: tl.constexpr = x.dtype
     half: tl.constexpr = TILE / 2
-    mx, my, w, w2 = rays(Ks, view, x + (left.to(dt) + half), y + (top.to(dt) + half), ORTHO)
+    mx, my, w, w2 = rays(Ks, view, x + (left.to(dt) + half), y, ORTHO)
     n = tl.full((), near, dt)
     f = tl.full((), far, dt)
     column = glue(column4, column4 + 1)
@@ -75,7 +75,7 @@ def nearest_kernel(records, ids, offsets, Ks, found, lane_x, W, H, tiles_x, tile
             nearest = (sphere[2] if ORTHO else far_off(sphere[0], sphere[1], sphere[2])) - sphere[3]
             farthest = -tile_min(tl.min(-depths[SLOTS - 1], 1, keep_dims=True))
             left_hits = tl.where(nearest < farthest, left_hits, tl.minimum(left_hits, i))
-            stop = tl.max(tl.max(left_hits, 1), 0)
+            stop = tl.minimum(stop, tl.max(tl.max(left_hits, 1), 0))      # of itself, too: what only bounds a loop crashes Triton 3.6
             batch = tl.where(i + tl.arange(0, LANES)[:, None] % TILE < left_hits, following, null)
         last_depth = depths[SLOTS - 1]
         last_place = places[SLOTS - 1]

@@ -1,4 +1,4 @@
-"""Pulsar's spheres: outlines, and blending of up to 4 channels, a warp to 4 tiles of 8 x 8 pixels and a lane to a row, as in `blending.py`.
+"""Pulsar's spheres: blending of up to 4 channels, a warp to 4 tiles of 8 x 8 pixels and a lane to a row, as in `blending.py`.
 
 A softmax over the spheres along each ray, in one pass, as in flash attention: sums are relative to the largest term so far. The backward
 computes all terms again, from the logarithm of the softmax's denominator. More channels are matrix products, in `sphere_features.py`.
@@ -10,7 +10,6 @@ import torch
 import triton
 import triton.language as tl
 from torch import Tensor
-from tsplat_reference.constants import EVERYWHERE, ON_OUTLINE
 
 from tsplat.kernels.footprint import SUMS, TILE
 from tsplat.kernels.launch import Launcher, ceil_div, current_target, launch
@@ -29,6 +28,7 @@ from tsplat.kernels.sphere_geometry import (
     term,
     term_gradients,
 )
+from tsplat.kernels.sphere_outlines import outlines as outlines
 from tsplat.kernels.sphere_tracking import nearest_hits as nearest_hits
 from tsplat.kernels.tiles import (
     block_pixels,
@@ -41,71 +41,12 @@ from tsplat.kernels.tiles import (
     load_pixels,
     of_batch,
     prefetch_records,
+    row_dot,
     store_channels,
     tile_list,
     tile_min,
     tile_sums,
 )
-
-ANYWHERE = tl.constexpr(EVERYWHERE)
-OUTLINE = tl.constexpr(ON_OUTLINE)
-
-
-@Launcher
-@triton.jit(do_not_specialize=["R", "N", "rows", "W", "H"])
-def outlines_kernel(centers, radii, Ks, radii2d, means2d, conics, opacities, depths, R, N, rows, W, H, near: tl.float64, far: tl.float64,
-                    ORTHO: tl.constexpr, BLOCK: tl.constexpr):
-    """See `tsplat_reference.outlines`."""
-    i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
-    real = i < R
-    x = tl.load(centers + 3 * i, mask=real, other=0.0)
-    y = tl.load(centers + 3 * i + 1, mask=real, other=0.0)
-    z = tl.load(centers + 3 * i + 2, mask=real, other=0.0)
-    r = tl.load(radii + i % rows, mask=real, other=1.0)
-    dt: tl.constexpr = x.dtype
-    nearest = tl.full((), near, dt)
-    farthest = tl.full((), far, dt)
-    K = Ks + i // N * 9
-    fx = tl.load(K, mask=real, other=1.0)
-    fy = tl.load(K + 4, mask=real, other=1.0)
-    cx = tl.load(K + 2, mask=real, other=0.0)
-    cy = tl.load(K + 5, mask=real, other=0.0)
-    finite = (tl.abs(x + y + z + r) < float("inf")) & (r > 0)
-    x = tl.where(finite, x, 1.0)
-    y = tl.where(finite, y, 1.0)
-    z = tl.where(finite, z, 1.0)
-    r = tl.where(finite, r, 1.0)
-    if ORTHO:
-        depth = z - r
-        seen = finite & (z > nearest) & (depth < farthest)
-        u = fx * x + cx
-        v = fy * y + cy
-        a = 1.0 / ((fx * r) * (fx * r))
-        b = x * 0.0
-        c = 1.0 / ((fy * r) * (fy * r))
-    else:
-        distance = tl.sqrt(x * x + y * y + z * z)
-        depth = distance - r
-        tangent2 = depth * (distance + r)               # squared length of a tangent
-        seen = finite & (depth > 0) & (tl.sqrt(tl.maximum(tangent2, 0.0)) > nearest) & (depth < farthest) & (z > -r)
-        ellipse = seen & (z > r)
-        before = tl.where(ellipse, (z - r) * (z + r), 1.0)
-        scale = before / (r * r * tl.where(ellipse, tangent2, 1.0))
-        u = tl.where(ellipse, fx * (x * z / before) + cx, W.to(dt) / 2)
-        v = tl.where(ellipse, fy * (y * z / before) + cy, H.to(dt) / 2)
-        anywhere = tl.full((), ANYWHERE, dt)
-        a = tl.where(ellipse, scale * (y * y + before) / (fx * fx), anywhere)
-        b = tl.where(ellipse, -scale * x * y / (fx * fy), 0.0)
-        c = tl.where(ellipse, scale * (x * x + before) / (fy * fy), anywhere)
-    tl.store(radii2d + 2 * i, seen.to(tl.int32), mask=real)
-    tl.store(radii2d + 2 * i + 1, seen.to(tl.int32), mask=real)
-    tl.store(means2d + 2 * i, u, mask=real)
-    tl.store(means2d + 2 * i + 1, v, mask=real)
-    tl.store(conics + 3 * i, a, mask=real)
-    tl.store(conics + 3 * i + 1, b, mask=real)
-    tl.store(conics + 3 * i + 2, c, mask=real)
-    tl.store(opacities + i, tl.full((BLOCK,), OUTLINE, dt), mask=real)
-    tl.store(depths + i, depth, mask=real)
 
 
 @Launcher
@@ -118,7 +59,7 @@ def sphere_fwd_kernel(records, ids, offsets, backgrounds, gamma, Ks, image, dept
     view, tile, exists, left, top, x, y, column4, pixel4 = block_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
     dt: tl.constexpr = x.dtype
     half: tl.constexpr = TILE / 2
-    mx, my, w, w2 = rays(Ks, view, x + (left.to(dt) + half), y + (top.to(dt) + half), ORTHO)
+    mx, my, w, w2 = rays(Ks, view, x + (left.to(dt) + half), y, ORTHO)
     n, f, level, slope, scale = depth_slope(gamma, near, far, dt)
     b = backgrounds + view * D
     peak = x * 0.0 + tl.full((), background_depth, dt) * scale          # logarithms are to base 2
@@ -209,7 +150,7 @@ def sphere_bwd_kernel(records, ids, offsets, used, gamma, Ks, cutoff, logsumexp,
     view, tile, exists, left, top, x, y, column4, pixel4 = block_pixels(block, lane_x, tiles_x, tiles_y, W, H, LANES)
     dt: tl.constexpr = x.dtype
     half: tl.constexpr = TILE / 2
-    mx, my, w, w2 = rays(Ks, view, x + (left.to(dt) + half), y + (top.to(dt) + half), ORTHO)
+    mx, my, w, w2 = rays(Ks, view, x + (left.to(dt) + half), y, ORTHO)
     n, f, level, slope, scale = depth_slope(gamma, near, far, dt)
     inv_gamma = 1.0 / tl.load(gamma)
     depth1 = 1.0 / (f - n)
@@ -262,18 +203,18 @@ def sphere_bwd_kernel(records, ids, offsets, used, gamma, Ks, cutoff, logsumexp,
             if v_depth is not None:
                 g += distance_in * v_z
             s0, s1, s2, s3, s4, s5, pixel_mx, pixel_my = term_gradients(
-                g, e, v_z, t, s, h, a, distance_in, mx, my, w, X, Y, depth, R, r, o, distance, -(o * depth1) * inv_gamma, inv_gamma,
+                g, e, v_z, t, s, h, a, distance_in, mx, my, w, w2, X, Y, depth, R, r, o, distance, -(o * depth1) * inv_gamma, inv_gamma,
                 depth0, depth1, EPS, 1, ORTHO, CHORD, PTX)
             if v_rays is not None:
                 v_mx += pixel_mx
                 v_my += pixel_my
             weight = e - e * s
-            w0 = o * tl.sum(weight * v0, 1, keep_dims=True)
-            w1 = o * tl.sum(weight * v1, 1, keep_dims=True) if D > 1 else none
-            w2_ = o * tl.sum(weight * v2, 1, keep_dims=True) if D > 2 else none
-            w3 = o * tl.sum(weight * v3, 1, keep_dims=True) if D > 3 else none
+            c0 = o * row_dot(weight, v0)
+            c1 = o * row_dot(weight, v1) if D > 1 else none
+            c2 = o * row_dot(weight, v2) if D > 2 else none
+            c3 = o * row_dot(weight, v3) if D > 3 else none
             COUNT: tl.constexpr = 12 if D > 3 else 9
-            first, slot, second, second_slot, has_second = tile_sums(s0, s1, s2, s3, s4, s5, w0, w1, w2_, w3, none, none, COUNT, PTX)
+            first, slot, second, second_slot, has_second = tile_sums(s0, s1, s2, s3, s4, s5, c0, c1, c2, c3, none, none, COUNT, PTX)
             if PER_HIT:
                 q = sums + (start + i + u) * SUMS
                 tl.store(q + slot, first, mask=real)
@@ -327,20 +268,6 @@ def upstream_kernel(image, depths, logsumexp, backgrounds, gamma, v_image, v_dep
         begin += DB
     tl.store(common + at, same, mask=inside)
     tl.store(out + D, -level * inv_gamma * tl.sum(weight * (same + behind), 0))
-
-
-def outlines(centers: Tensor, radii: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float
-             ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-    """Launcher; see `tsplat_reference.outlines`."""
-    C, N = centers.shape[:2]
-    out = (centers.new_empty(C, N, 2, dtype=torch.int32), centers.new_empty(C, N, 2), centers.new_empty(C, N, 3), centers.new_empty(C, N),
-           centers.new_empty(C, N))
-    if C * N:
-        options = launch("outlines")
-        outlines_kernel[(ceil_div(C * N, options["BLOCK"]),)](centers.contiguous(), radii.contiguous(), Ks.contiguous(), *out, C * N, N,
-                                                              radii.shape[0] * N, width, height, near, far, ORTHO=model == "orthographic",
-                                                              **options)
-    return out
 
 
 def blend_spheres_backward(centers: Tensor, radii: Tensor, opacities: Tensor, features: Tensor, backgrounds: Tensor, gamma: Tensor, Ks: Tensor,
@@ -401,14 +328,14 @@ def _terms_backward(s: Spheres, radii: Tensor, opacities: Tensor, gamma: Tensor,
     else:
         v_features, rows = torch.zeros_like(s.features), max(len(s.features) * s.N, 1)
         v_rays = gamma.new_empty(s.C, s.tiles // s.C, 4) if intrinsics else None
-        flags |= {"P": TILE.value**2, "PRECISION": "tf32x3" if ptx else "ieee"}
+        block = {"P": TILE.value**2, "PRECISION": "tf32x3" if ptx else "ieee", **flags}
         options = launch("sphere_features_backward")
         sphere_features_bwd_kernel[(s.tiles, ceil_div(s.D, options["DB"]))](
-            s.records, s.ids, s.offsets, used, gamma, s.Ks, cutoff, logsumexp, v_image, v_features, *size, rows, s.D, near, far, **flags,
+            s.records, s.ids, s.offsets, used, gamma, s.Ks, cutoff, logsumexp, v_image, v_features, *size, rows, s.D, near, far, **block,
             **options)
         sphere_feature_bwd_kernel[(s.tiles,)](
             s.records, s.features, s.ids, s.offsets, used, gamma, s.Ks, cutoff, logsumexp, common, v_image, v_depth, sums, v_rays, *size, rows,
-            s.D, near, far, EPS=eps, **flags, **launch("sphere_feature_backward"))
+            s.D, near, far, EPS=eps, **block, **launch("sphere_feature_backward"))
     *gradients, v_some = s.gradients(sums[:s.R], radii, opacities)
     return [v_some if v_features is None else v_features, *gradients, sums[:s.R, 5].sum(), _intrinsics_gradient(s.Ks, v_rays)]
 

@@ -1,5 +1,6 @@
 """One dispatcher op per stage and direction. CPU tensors run the reference; torch.compile, autograd and opcheck see ops."""
 
+from tsplat.ops.adam import adam_rows as adam_rows
 from tsplat.ops.binning import bin_splats as bin_splats
 from tsplat.ops.binning import bin_splats_fixed as bin_splats_fixed
 from tsplat.ops.blending import blend as blend

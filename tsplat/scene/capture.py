@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from torch import Tensor
 from tsplat.camera import Camera
 from tsplat.scene.colmap import is_colmap, read_colmap
 from tsplat.scene.image_files import image_size
-from tsplat.scene.images import CACHE_BYTES, ImageStore, Photo
+from tsplat.scene.images import CACHE_BYTES, ImageStore, Photo, read_depth
 from tsplat.scene.transforms import read_transforms
 from tsplat.scene.view import Points, View
 
@@ -38,6 +38,7 @@ class Capture:
         point_colors: `[M, 3]` float32 in 0..1, or None.
         masked: whether a fourth channel comes from mask files (0 = leave this pixel out of the loss) rather than from
             the photos' own alpha (0 = nothing there, the background shows).
+        depths: files of depth maps, by photo (see `depth`); empty where there are none at all.
     """
 
     names: list[str]
@@ -51,6 +52,7 @@ class Capture:
     points: Tensor | None = None
     point_colors: Tensor | None = None
     masked: bool = False
+    depths: list[Path | None] = field(default_factory=list)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -58,6 +60,17 @@ class Capture:
     def camera(self, index: int) -> Camera:
         """The pinhole camera of photo `index`, for the image `images[index]`."""
         return Camera(self.viewmats[index], self.Ks[index], self.width[index], self.height[index])
+
+    def depth(self, index: int, width: int, height: int) -> Tensor | None:
+        """The depth map of photo `index`, `[height, width]` float32: camera z, unknown where not finite or not above 0.
+
+        None where the photo has none. Nearest samples, so that no depth is made up between a foreground and a background.
+
+        Raises:
+            ValueError: naming the file, if it is no array `[h, w]` of numbers.
+        """
+        path = self.depths[index] if self.depths else None
+        return None if path is None else read_depth(path, width, height)
 
     @property
     def extent(self) -> float:
@@ -73,7 +86,8 @@ def load_capture(path: str | os.PathLike[str], *, downscale: float = 1, test_eve
 
     Recognised, in this order: a COLMAP model in `sparse/0`, `sparse`, `colmap/sparse/0` or `path` itself, with the photos
     in `images`; `transforms_train.json` (with `transforms_test.json` as the photos held out); `transforms.json`. Masks
-    are `masks/<photo>.png`, `<photo>.mask.png` or `<stem>_mask.png` beside the photo, or the JSON's `mask_path`.
+    are `masks/<photo>.png`, `<photo>.mask.png` or `<stem>_mask.png` beside the photo, or the JSON's `mask_path`. Depth maps,
+    for undistorted photos, are `depths/<photo>.npy` or `depths/<stem>.npy` beside the folder of the photos.
 
     Args:
         path: the folder, or a JSON file.
@@ -115,6 +129,7 @@ def load_capture(path: str | os.PathLike[str], *, downscale: float = 1, test_eve
         points=None if xyz is None else torch.from_numpy(xyz),
         point_colors=None if rgb is None else torch.from_numpy(rgb),
         masked=any(photo.mask is not None for photo in photos),
+        depths=_depth_files(views),
     )
 
 
@@ -182,3 +197,15 @@ def _find_mask(view: View) -> Path | None:
         folder / file.with_name(f"{file.stem}_mask.png"),
     )
     return next((candidate for candidate in candidates if candidate.is_file()), None)
+
+
+def _depth_files(views: Sequence[View]) -> list[Path | None]:
+    files = []
+    for view in views:
+        folder, file = view.folder.parent / "depths", Path(view.file)
+        candidates = (folder / f"{file}.npy", folder / file.with_suffix(".npy"))
+        found = next((candidate for candidate in candidates if candidate.is_file()), None)
+        if found is not None and view.lens.distorted:
+            raise ValueError(f"{found}: depth maps of distorted photos are not supported; undistort the photos first")
+        files.append(found)
+    return files if any(files) else []

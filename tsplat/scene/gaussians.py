@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -17,7 +16,6 @@ from tsplat.scene.neighbours import nearest_squared_distances
 SH_C0 = 0.28209479177387814      # the constant band of the real spherical harmonics
 MAX_SH_DEGREE = 4
 MIN_SCALE = 1e-7
-LOAD_SUFFIXES = (".ply",)
 
 
 class Gaussians(Splats):
@@ -123,20 +121,28 @@ class Gaussians(Splats):
 
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Gaussians:
-        """Read a file in the format of its suffix: `.ply` (3DGS).
+        """Read a file in the format of its name: `.ply` (3DGS, or PlayCanvas's compressed kind), `.splat`, `.spz`, `.glb`
+        (KHR_gaussian_splatting), `.sog` (or the meta.json or folder of an unpacked one). All have the axes of a .ply then.
 
         Raises:
-            ValueError: an unknown suffix, or a file that is not what its suffix says.
+            ValueError: an unknown name, or a file that is not what its name says: one line with the file and what is wrong where.
+            ImportError: an .spz of version 4 without the package zstandard.
+            OSError: the file cannot be read.
         """
-        from tsplat.scene.ply import read_ply
-        _check_suffix(path)
-        return read_ply(path)
+        from tsplat.scene import formats
+        return formats.load(path)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write a file in the format of the suffix of `path`: `.ply` (3DGS). An older file stays until the new one is whole."""
-        from tsplat.scene.ply import write_ply
-        _check_suffix(path)
-        write_ply(path, self)
+        """Write a file in the format of its name: `.ply` (3DGS; all others round), `.compressed.ply` (PlayCanvas), `.splat`, `.spz`, `.glb`.
+
+        An older file stays until the new one is whole. What the format cannot hold is left out with a warning.
+
+        Raises:
+            ValueError: an unknown name, or Gaussians that the format cannot hold at all.
+            OSError: the file cannot be written; an old one stays as it was.
+        """
+        from tsplat.scene import formats
+        formats.save(path, self)
 
     @classmethod
     def check(cls, tensors: Mapping[str, Tensor]) -> None:
@@ -151,9 +157,3 @@ class Gaussians(Splats):
         if sh_rest.shape[1] not in sizes:
             raise ValueError(f"sh_rest: expected {', '.join(map(str, sizes))} coefficients (degree 0 to {MAX_SH_DEGREE}); "
                              f"got {sh_rest.shape[1]}")
-
-
-def _check_suffix(path: str | os.PathLike[str]) -> None:
-    suffix = Path(path).suffix.lower()
-    if suffix not in LOAD_SUFFIXES:
-        raise ValueError(f"{os.fspath(path)}: expected a file name that ends in {' or '.join(LOAD_SUFFIXES)}; got {suffix!r}")

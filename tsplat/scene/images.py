@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample, interpolate
@@ -95,6 +96,23 @@ def load_photo(photo: Photo) -> Tensor:
         mask = _reshape(_planes(read_image(photo.mask)[..., :1]), photo)
         planes = torch.cat([planes[:3], mask * planes[3:] if len(planes) == 4 else mask])
     return (planes * 255).round().clamp(0, 255).to(torch.uint8).permute(1, 2, 0).contiguous()
+
+
+def read_depth(path: Path, width: int, height: int) -> Tensor:
+    """A depth map from a .npy file `[h, w]` of numbers, as float32 `[height, width]` nearest samples.
+
+    Raises:
+        ValueError: naming the file, if it is something else.
+    """
+    try:
+        depth = np.load(path, allow_pickle=False)
+    except (ValueError, EOFError) as error:
+        raise ValueError(f"{path}: expected a .npy file of depths; {error}") from None
+    if depth.ndim != 2 or depth.dtype.kind not in "fiu" or not depth.size:
+        raise ValueError(f"{path}: expected depths [h, w]; got {depth.dtype} {list(depth.shape)}")
+    depth = torch.from_numpy(depth.astype(np.float32))
+    rows, columns = (((torch.arange(n) + 0.5) * (size / n)).long() for n, size in zip((height, width), depth.shape, strict=True))
+    return depth[rows[:, None], columns]
 
 
 def _planes(image: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from tsplat.scene.gaussians import MAX_SH_DEGREE, Gaussians
-from tsplat.scene.ply_table import binary_vertices, columns, read_header, row_type, write_columns
+from tsplat.scene.ply_table import binary_rows, columns, read_header, row_type, write_columns
 
 MEANS, NORMALS, DC = ("x", "y", "z"), ("nx", "ny", "nz"), ("f_dc_0", "f_dc_1", "f_dc_2")
 SCALES, QUATS = ("scale_0", "scale_1", "scale_2"), ("rot_0", "rot_1", "rot_2", "rot_3")
@@ -34,7 +34,7 @@ def read_ply(path: str | os.PathLike[str]) -> Gaussians:
     _, properties = header.elements["vertex"]
     names = [name for name, _ in properties]
     if "chunk" in header.elements or "packed_position" in names:
-        raise ValueError(f"{path}: this is a PlayCanvas compressed .ply; expected a plain 3DGS .ply (convert it first)")
+        raise ValueError(f"{path}: this is a PlayCanvas compressed .ply; expected a plain 3DGS .ply (Gaussians.load reads both)")
     if header.format != "binary_little_endian":
         raise ValueError(f"{path}: expected a binary_little_endian .ply of Gaussians; got {header.format}")
     missing = [name for name in (*MEANS, *DC, "opacity", *SCALES, *QUATS) if name not in names]
@@ -46,7 +46,7 @@ def read_ply(path: str | os.PathLike[str]) -> Gaussians:
     if rest not in degrees or not set(rest_names) <= set(names):
         raise ValueError(f"{path}: expected {', '.join(map(str, degrees))} columns f_rest_0, f_rest_1, ...; got {rest}")
 
-    rows = binary_vertices(path, header)
+    rows = binary_rows(path, header)
     logits = columns(rows, ("opacity",))[:, 0]
     logits = torch.where(logits.isinf(), logits.sign() * MAX_LOGIT, logits)
     sh_rest = columns(rows, rest_names).view(len(rows), 3, rest // 3).transpose(1, 2)      # channel-major in the file
@@ -92,7 +92,7 @@ def read_point_ply(path: str | os.PathLike[str]) -> tuple[NDArray[np.float32], N
         for i, column in enumerate(names):
             rows[column] = table[:, i]
     elif header.format == "binary_little_endian":
-        rows = binary_vertices(path, header)
+        rows = binary_rows(path, header)
     else:
         raise ValueError(f"{path}: expected an ascii or binary_little_endian .ply that begins with its vertices; "
                          f"got {header.format}")

@@ -54,7 +54,7 @@ def read_header(path: Path) -> Header:
             case [] | ["obj_info" | "ply", *_]:
                 pass
             case _:
-                raise ValueError(f"{path}: expected a .ply header line; got {line!r}")
+                raise ValueError(f"{path}: expected a .ply header line; got {line[:80]!r}")
     if "vertex" not in header.elements:
         raise ValueError(f"{path}: expected an element `vertex`; got {', '.join(header.elements) or 'no element'}")
     return header
@@ -72,18 +72,26 @@ def _header_lines(path: Path, file: BinaryIO) -> list[str]:
     raise ValueError(f"{path}: the .ply header has no end_header line")
 
 
-def binary_vertices(path: Path, header: Header) -> NDArray[Any]:
-    """The rows of the vertex element, `[N]` structured; ValueError if the file is shorter than its header says."""
-    offset = header.size
-    for name, (count, properties) in header.elements.items():
-        row = row_type(path, name, properties)
-        if name == "vertex":
-            break
-        offset += count * row.itemsize
-    expected, found = offset + count * row.itemsize, path.stat().st_size
-    if found < expected:
-        raise ValueError(f"{path}: truncated: expected {expected} bytes for {count} vertices; found {found}")
-    return np.fromfile(path, dtype=row, count=count, offset=offset)
+def binary_rows(path: Path, header: Header, name: str = "vertex") -> NDArray[Any]:
+    """The rows of an element, `[N]` structured; ValueError if the file is shorter or longer than its header says.
+
+    Lists may only follow the element; then the end of the file is not known.
+    """
+    end = header.size
+    ends = {}
+    lists = False
+    for element, (rows, properties) in header.elements.items():
+        lists = lists or (name in ends and any(kind == "list" for _, kind in properties))
+        if not lists:
+            end += rows * row_type(path, element, properties).itemsize
+            ends[element] = end
+    count, properties = header.elements[name]
+    row, found = row_type(path, name, properties), path.stat().st_size
+    if found < end:
+        raise ValueError(f"{path}: truncated: expected {end} bytes for {count} rows of `{name}`; found {found}")
+    if found > end and not lists:
+        raise ValueError(f"{path}: at byte {end}: oversized: expected the end; found {found - end} more bytes")
+    return np.fromfile(path, dtype=row, count=count, offset=ends[name] - count * row.itemsize)
 
 
 def row_type(path: Path, element: str, properties: list[tuple[str, str]]) -> np.dtype[Any]:

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from tsplat.checks import check_tensor
 from tsplat.scene.module import Splats
 from tsplat.scene.neighbours import nearest_squared_distances
-from tsplat.scene.ply_table import binary_vertices, columns, read_header, write_columns
+from tsplat.scene.ply_table import binary_rows, columns, read_header, write_columns
 
 MIN_RADIUS = 1e-7
 COLUMNS = ("x", "y", "z", "radius", "opacity")
@@ -108,7 +108,7 @@ class Spheres(Splats):
             gamma, near, far = map(float, numbers)
         except ValueError:
             raise ValueError(f"{path}: expected the comment '{COMMENT} gamma near far'; got {' '.join(numbers)!r}") from None
-        rows = binary_vertices(path, header)
+        rows = binary_rows(path, header)
         features = tuple(f"feature_{i}" for i in range(sum(name.startswith("feature_") for name in names)))
         if not set(features) <= set(names):
             raise ValueError(f"{path}: expected columns {', '.join(features)}; got {', '.join(names)}")

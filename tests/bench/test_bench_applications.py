@@ -1,0 +1,100 @@
+"""Pulsar's applications, a few steps of each on small images: they run, improve on their start, and draw."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+import torch
+
+from tsplat.scene.image_files import image_size
+
+FOLDER = Path(__file__).resolve().parents[2] / "bench" / "applications"
+
+
+@pytest.fixture
+def application(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[ModuleType]:
+    """The script that the test is parametrised with, imported as if it ran from its folder."""
+    names = [path.stem for path in FOLDER.glob("*.py")]
+    monkeypatch.syspath_prepend(FOLDER)
+    yield importlib.import_module(request.param)
+    for name in names:
+        sys.modules.pop(name, None)
+
+
+def options(shared: Path, tmp_path: Path, text: str) -> list[str]:
+    return ["--data", str(shared / "data"), "--picture", str(tmp_path / "picture.png"), *text.split()]
+
+
+@pytest.mark.parametrize("application", ["silhouettes"], indirect=True)
+def test_silhouettes(application: ModuleType, shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert application.main(options(shared, tmp_path, "--steps 45 --rounds 3 --segments 6")) > 0.5         # 0.13 of the start
+    assert "218 spheres, 45 steps, held-out IoU" in capsys.readouterr().out
+    assert image_size(tmp_path / "picture.png") == (6 * 128, 3 * 128)
+
+
+@pytest.mark.parametrize("application", ["silhouettes"], indirect=True)
+def test_the_cube_that_is_a_sphere(application: ModuleType) -> None:
+    vertices = application.cube_sphere(15)
+    assert vertices.shape == (1352, 3)
+    torch.testing.assert_close(vertices.norm(dim=1), torch.ones(1352))
+    assert len(vertices.unique(dim=0)) == 1352
+
+
+@pytest.mark.parametrize("application", ["illumination"], indirect=True)
+def test_illumination(application: ModuleType, shared: Path, tmp_path: Path) -> None:
+    before, after = application.main(options(shared, tmp_path, "--steps 20 --rounds 2 --spheres 150 --samples 1000 --cameras 12 --size 32"))
+    assert after < before
+    assert image_size(tmp_path / "picture.png") == (5 * 32, 4 * 32)
+
+
+@pytest.mark.parametrize("application", ["illumination"], indirect=True)
+def test_chamfer_distance(application: ModuleType) -> None:
+    """Half of (mean of 0, 3) and half of (mean of 0, 4)."""
+    a, b = torch.tensor([[0.0, 0, 0], [3, 0, 0]]), torch.tensor([[0.0, 0, 0], [0, 4, 0]])
+    assert application.chamfer(a, b) == pytest.approx((1.5 + 2) / 2, rel=1e-6)
+
+
+@pytest.mark.parametrize("application", ["head"], indirect=True)
+def test_head_and_its_neural_shading(application: ModuleType, shared: Path, tmp_path: Path) -> None:
+    spheres = tmp_path / "made" / "head.pt"
+    result = application.main(options(shared, tmp_path, f"--steps 8 --volume 200 --refinements 1 --downscale 8 --spheres {spheres}"))
+    names, counts, quality = zip(*result.history, strict=True)
+    assert names == ("volume", "volume, pruned", "refinement 1, before", "refinement 1", "refinement 1, pruned")
+    assert counts[2] == 12 * counts[1]
+    assert quality[3] > quality[2]
+    assert len(result.spheres) == counts[4]
+    assert image_size(tmp_path / "picture.png") == (4 * 32, 2 * 32)
+    shading = importlib.import_module("neural_shading")
+    before, longer, after = shading.main(options(shared, tmp_path, f"--steps 5 --downscale 8 --spheres {spheres}"))
+    assert longer > before
+    assert after > before
+    assert image_size(tmp_path / "picture.png") == (4 * 32, 4 * 32)
+
+
+@pytest.mark.parametrize("application", ["view_dependent"], indirect=True)
+def test_view_dependent_shading(application: ModuleType, shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    qualities = application.main(options(shared, tmp_path, "--steps 5 --volume 200 --refinements 0 --downscale 16"))
+    assert all(quality > 5 for quality in qualities)
+    assert "with a network of the viewing direction" in capsys.readouterr().out
+    assert image_size(tmp_path / "picture.png") == (5 * 25, 3 * 25)
+
+
+@pytest.mark.parametrize("application", ["view_dependent"], indirect=True)
+def test_viewing_directions(application: ModuleType) -> None:
+    """From the eye through a point to where the camera sees that point."""
+    import tsplat
+
+    eye, point = torch.tensor([1.0, -2, 3]), torch.tensor([0.3, 0.1, -0.2])
+    camera = tsplat.Camera.look_at(eye, (0, 0, 0), (0, 1, 0), width=64, height=48)
+    seen = camera.Ks @ (camera.viewmats[:3, :3] @ point + camera.viewmats[:3, 3])
+    column, row = (seen[:2] / seen[2]).floor().long().tolist()
+    expected = torch.nn.functional.normalize(point - eye, dim=0)
+    angles = torch.linalg.cross(application.directions(camera), expected.expand(48, 64, 3)).norm(dim=-1)
+    assert angles.argmin() == row * 64 + column
+    assert angles[row, column] < 0.01                                                   # less than a pixel, fov/64 = 0.0136
+    torch.testing.assert_close(application.directions(camera).norm(dim=-1), torch.ones(48, 64))

@@ -1,0 +1,98 @@
+"""The adaptive density control of 3DGS (Kerbl et al. 2023, section 5.2): clone, split, prune, reset of the opacities."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from tsplat.camera import Camera
+from tsplat.fit.density.control import NoControl, Schedule
+from tsplat.fit.density.gradients import ScreenGradients
+from tsplat.fit.density.rows import forget, grow, prune
+from tsplat.rasterize import Meta
+
+DENSE = 0.01          # of the extent: larger splats are split, others cloned
+HUGE = 0.1            # of the extent: larger splats are pruned once there was a reset
+MIN_OPACITY = 0.005
+RESET_OPACITY = 0.01
+
+
+class AdaptiveControl(NoControl):
+    """Splats whose place on the screen the loss pulls at are cloned or split; faint and huge ones are pruned.
+
+    Args:
+        extent: of the scene (`Capture.extent`).
+        schedule: when to act; in 3DGS after every 100th step from 500 to 15,000.
+        threshold: of the mean norm of the screen-space gradient (NDC) of a splat that is cloned or split.
+        absgrad: take gradients without regard to sign (AbsGS); its threshold is about 4 times as high.
+        reset_every: steps between resets of the opacities to at most 0.01, within the schedule; 0: never. Every splat then
+            has to earn its opacity anew, which removes floaters. In the `settle` steps after it the scene is not itself.
+        settle: how many.
+        max_splats: where more would be made, those with the largest gradients are, up to this number in all.
+    """
+
+    def __init__(self, extent: float, schedule: Schedule, *, threshold: float | None = None, absgrad: bool = False,
+                 reset_every: int = 3000, settle: int = 500, max_splats: int | None = None) -> None:
+        self.extent, self.schedule = extent, schedule
+        self.threshold = (8e-4 if absgrad else 2e-4) if threshold is None else threshold
+        self.reset_every, self.settle, self.max_splats = reset_every, settle, max_splats
+        self.gradients = ScreenGradients(absgrad)
+
+    def probes(self, scene: nn.Module, step: int, cameras: int = 1) -> dict[str, Tensor]:
+        """Of the screen-space gradient, up to the end of the schedule."""
+        return self.gradients.probes(scene, cameras) if step < self.schedule.stop else {}
+
+    def observe(self, meta: Meta, camera: Camera) -> None:
+        """Add the screen-space gradients of one backward pass."""
+        self.gradients.observe(meta, camera)
+
+    def growth(self, scene: nn.Module, step: int) -> int:
+        """At most one new splat for each that is above the threshold."""
+        if not self.schedule.due(step):
+            return 0
+        return len(self._parents(scene))
+
+    @torch.no_grad()
+    def update(self, scene: nn.Module, optimiser: Optimizer, step: int, generator: torch.Generator) -> None:
+        """Clone and split, prune, reset."""
+        if self.schedule.due(step):
+            parents = self._parents(scene)
+            large = scene.get_parameter("log_scales").amax(1) > math.log(DENSE * self.extent)
+            grow(scene, optimiser, parents, large[parents], generator)
+            self.gradients.clear()
+            keep = scene.get_parameter("opacity_logits").sigmoid() >= MIN_OPACITY
+            if self.reset_every and step > self.reset_every:
+                keep &= scene.get_parameter("log_scales").amax(1) <= math.log(HUGE * self.extent)
+            prune(scene, optimiser, keep)
+        if self._resets(step):
+            scene.get_parameter("opacity_logits").clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+            forget(scene, optimiser, slice(None), ("opacity_logits",))
+
+    def settled(self, step: int) -> bool:
+        """False in the `settle` steps that begin with a reset."""
+        if not self.reset_every:
+            return True
+        last = step - step % self.reset_every
+        return not (self._resets(last) and step < last + self.settle)
+
+    def state_dict(self) -> dict[str, Any]:
+        """The sums of gradients."""
+        return {"gradients": self.gradients.state_dict()}
+
+    def load_state_dict(self, saved: dict[str, Any]) -> None:
+        """Take on what `state_dict` gave."""
+        self.gradients.load_state_dict(saved["gradients"])
+
+    def _resets(self, step: int) -> bool:
+        return bool(self.reset_every) and step > 0 and step % self.reset_every == 0 and step < self.schedule.stop
+
+    def _parents(self, scene: nn.Module) -> Tensor:
+        means = scene.get_parameter("means")
+        norms = self.gradients.mean(len(means), means.detach())
+        parents = (norms > self.threshold).nonzero()[:, 0]
+        room = len(parents) if self.max_splats is None else max(0, self.max_splats - len(means))
+        return parents if len(parents) <= room else parents[norms[parents].topk(room).indices].sort().values

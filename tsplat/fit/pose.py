@@ -1,0 +1,50 @@
+"""Poses as parameters: increments in Se3, for the cameras of a fit and for held-out ones with the scene as it is."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import torch
+from torch import Tensor
+
+from tsplat.camera import Camera
+
+LAST_RATE = 0.01       # of the first
+
+
+def moved(camera: Camera, increment: Tensor, extent: float) -> Camera:
+    """The camera after exp(increment), in its own axes: `[6]`, a shift in units of `extent`, then a rotation in radians.
+
+    Small numbers of like size for both, so that one learning rate suits them. Differentiable at 0.
+    """
+    from kornia.geometry.liegroup import Se3
+
+    step: Tensor = Se3.exp(torch.cat([increment[:3] * extent, increment[3:]])[None]).matrix()[0]        # [4, 4]
+    if not increment.requires_grad:                                # kornia's Se3 makes parameters of what it is given
+        step = step.detach()
+    return dataclasses.replace(camera, viewmats=step @ camera.viewmats)
+
+
+def refined(camera: Camera, loss: Callable[[Camera], Tensor], extent: float, steps: int, rate: float) -> Camera:
+    """The camera after `steps` of Adam on its pose alone.
+
+    Args:
+        camera: to begin with.
+        loss: of a camera, differentiable in its pose.
+        extent: see `moved`.
+        rate: the first learning rate; it falls to 1 % of that, log-linearly.
+    """
+    increment = camera.viewmats.new_zeros(6, requires_grad=True)
+    adam = torch.optim.Adam([increment], lr=rate)
+    best, least = camera, float("inf")
+    for step in range(steps + 1):
+        here = moved(camera, increment, extent)
+        value = loss(here)
+        if float(value.detach()) < least:                          # the last step need not be the best
+            best, least = dataclasses.replace(here, viewmats=here.viewmats.detach()), float(value.detach())
+        if step < steps:
+            (increment.grad,) = torch.autograd.grad(value, increment)
+            adam.param_groups[0]["lr"] = rate * LAST_RATE ** (step / max(1, steps - 1))
+            adam.step()
+    return best

@@ -1,0 +1,103 @@
+"""What the trainer has to know of what a scene is made of. A new kind of scene is one more class here, and no branch elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Protocol, TypeAlias
+
+from torch import Tensor
+
+from tsplat.camera import Camera
+from tsplat.fit.config import FitConfig
+from tsplat.fit.density import MCMC, AdaptiveControl, Budget, Control, NoControl
+from tsplat.fit.drawing import draw
+from tsplat.fit.initial import initial_gaussians
+from tsplat.fit.losses import scene_regulariser
+from tsplat.fit.optimiser import learning_rates
+from tsplat.fit.schedules import density_schedule, reset_interval, sh_degree_at
+from tsplat.rasterize import Rendering
+from tsplat.scene import Capture, Gaussians
+
+Scene: TypeAlias = Gaussians        # or whatever else a primitive makes: a module of parameters [N, ...], with `len` and `save`
+MAX_SPLATS = 1_000_000              # where a kind of density control without a budget ends
+
+
+class Primitive(Protocol):
+    """How scenes of one kind are started, drawn and optimised. The arguments are those of the classes that do it."""
+
+    def start(self, capture: Capture, config: FitConfig, generator: Any) -> Scene:
+        """The scene before the first step."""
+        ...
+
+    def load(self, saved: dict[str, Tensor]) -> Scene:
+        """The scene of which `state_dict` was saved."""
+        ...
+
+    def draw(self, scene: Scene, camera: Camera, background: Tensor, config: FitConfig, step: int | None = None, *, depth: bool = False,
+             probes: Mapping[str, Tensor] | None = None) -> Rendering:
+        """Render as at `step`, or (None) as finished."""
+        ...
+
+    def regulariser(self, scene: Scene, rendering: Rendering, config: FitConfig, extent: float) -> Tensor | None:
+        """What the loss has besides the photo."""
+        ...
+
+    def rates(self, config: FitConfig, extent: float, step: int) -> dict[str, float]:
+        """The learning rate of each parameter, by name."""
+        ...
+
+    def control(self, config: FitConfig, extent: float, splats: int) -> Control:
+        """Density control of a scene that starts with that many splats."""
+        ...
+
+
+class GaussianPrimitive:
+    """3D Gaussians."""
+
+    def start(self, capture: Capture, config: FitConfig, generator: Any) -> Scene:
+        """See `initial_gaussians`."""
+        return initial_gaussians(capture, config, generator)
+
+    def load(self, saved: dict[str, Tensor]) -> Scene:
+        """From its parameters."""
+        return Gaussians(**saved)
+
+    def draw(self, scene: Scene, camera: Camera, background: Tensor, config: FitConfig, step: int | None = None, *, depth: bool = False,
+             probes: Mapping[str, Tensor] | None = None) -> Rendering:
+        """With the bands of colours that are in use at `step`."""
+        degree = None if step is None else sh_degree_at(config, step)
+        return draw(scene, camera, background, sh_degree=degree, antialiased=config.antialiased, depth="accumulated" if depth else None,
+                    probes=probes)
+
+    def regulariser(self, scene: Scene, rendering: Rendering, config: FitConfig, extent: float) -> Tensor | None:
+        """See `scene_regulariser`."""
+        return scene_regulariser(scene.opacities, scene.scales, rendering.meta, extent, opacity=config.published("opacity_reg"),
+                                 scale=config.published("scale_reg"), opacity_depth=config.opacity_depth_reg)
+
+    def rates(self, config: FitConfig, extent: float, step: int) -> dict[str, float]:
+        """See `learning_rates`."""
+        return learning_rates(config, extent, step)
+
+    def control(self, config: FitConfig, extent: float, splats: int) -> Control:
+        """The kind that the config names."""
+        schedule, most = density_schedule(config), config.max_splats or MAX_SPLATS
+        if config.density == "budget":
+            return Budget(extent, schedule, config.max_splats or splats)
+        if config.density == "mcmc":
+            return MCMC(schedule, most)
+        if config.density == "adaptive":
+            reset = reset_interval(config)
+            return AdaptiveControl(extent, schedule, threshold=config.density_threshold, absgrad=config.density_absgrad, reset_every=reset,
+                                   settle=reset // 6, max_splats=most)
+        return NoControl()
+
+
+def primitive_of(config: FitConfig) -> Primitive:
+    """The primitive that the config names.
+
+    Raises:
+        NotImplementedError: it cannot be fitted yet.
+    """
+    if config.primitive == "spheres":
+        raise NotImplementedError("primitive: 'spheres' cannot be fitted yet; expected 'gaussians'")
+    return GaussianPrimitive()

@@ -1,0 +1,52 @@
+"""What changes over a fit, as functions of the step alone: rates, bands of colours, size of the photos, density control.
+
+All are parts of the length of the fit, so that few steps are a short fit, and not the beginning of a long one.
+"""
+
+from __future__ import annotations
+
+import math
+
+from tsplat.fit.config import FitConfig
+from tsplat.fit.density import Schedule
+
+REFERENCE_STEPS = 30_000   # the length of a fit that the rates of 3DGS, and those of the config, are made for
+MAX_FACTOR = 6.0     # by which fits of fewer steps raise the rates
+MIN_ACTIONS = 20     # of density control, if it went on to the end
+
+
+def rate_factor(config: FitConfig) -> float:
+    """By which the rates of a fit of 30,000 steps are raised: sqrt(30,000 / steps), and at most 6, as at 10 fits diverge.
+
+    Adam moves a parameter by about its rate per step, to and fro, so by about rate times sqrt(steps) in all, which so stays the
+    same for any number of steps down to 830.
+    """
+    return min(math.sqrt(REFERENCE_STEPS / max(1, config.steps)), MAX_FACTOR)
+
+
+def progress(config: FitConfig, step: int) -> float:
+    """0 at step 0, 1 at the last."""
+    return step / max(1, config.steps - 1)
+
+
+def sh_degree_at(config: FitConfig, step: int) -> int:
+    """The degree of the spherical harmonics in use at `step`: from 0 up to `sh_degree` in equal intervals of the warm-up."""
+    warmup = config.sh_warmup * config.steps
+    return config.sh_degree if step >= warmup else int(step / warmup * config.sh_degree)
+
+
+def divisor_at(config: FitConfig, step: int) -> int:
+    """By which the size of the photos is divided at `step`: 4, 2, 1 (3DGS, section 7.1)."""
+    warmup = config.resolution_warmup * config.steps
+    return 4 if 2 * step < warmup else 2 if step < warmup else 1
+
+
+def density_schedule(config: FitConfig) -> Schedule:
+    """When density control acts."""
+    every = min(config.density_every, max(1, config.steps // MIN_ACTIONS))
+    return Schedule(max(1, round(config.density_start * config.steps)), round(config.density_stop * config.steps), every)
+
+
+def reset_interval(config: FitConfig) -> int:
+    """Steps between resets of the opacities; 0: none."""
+    return round(config.reset_every * config.steps / REFERENCE_STEPS)

@@ -11,7 +11,9 @@ may grow by 64 MiB (files have a few kB) and in which a file may take 5 seconds.
 from __future__ import annotations
 
 import argparse
+import copy
 import io
+import itertools
 import json
 import random
 import re
@@ -38,7 +40,8 @@ from tsplat.scene.formats import find_format
 
 MEMORY = 64 << 20               # bytes by which the address space may grow
 SECONDS = 5
-INTERESTING = (0, 1, 2, 3, 4, 16, 127, 128, 255, 256, 0x7FFF, 0x8000, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF, (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
+INTERESTING = (0, 1, 2, 3, 4, 16, 127, 128, 255, 256, 0x7FFF, 0x8000, 0xFFFF, 0x7FFFFFFF, 0x80000000, 0xFFFFFFFF,
+               (1 << 63) - 1, 1 << 63, (1 << 64) - 1)
 NUMBERS = ("-1", "0", "1", "7", "1e999", "4294967296", "9" * 30, "9" * 5000, "0.5", "NaN", "-Infinity")
 VALUES = (None, True, -1, 0, 1, 3, 1 << 40, 10 ** 40, -0.5, 1e308, float("nan"), "", "..", "meta.json", "sh0.webp", "VEC3", [], [0], {}, {"a": 1})
 
@@ -109,7 +112,7 @@ def _version_4(spz: bytes) -> Parts:
     sizes = [size for size in (9 * n, n, 3 * n, 3 * n, 4 * n, 3 * n * ((degree + 1) ** 2 - 1)) if size]
     ends = np.cumsum([16, *sizes])
     header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, n, degree, bits, flags, len(sizes), 32)
-    return header, *(spz[a:b] for a, b in zip(ends[:-1], ends[1:], strict=True))
+    return header, *(spz[a:b] for a, b in itertools.pairwise(ends))
 
 
 def _frames(parts: Parts) -> bytes:
@@ -245,8 +248,8 @@ def _change_json(document: object, rng: random.Random) -> None:
             case 0:
                 container[key] = rng.choice(VALUES)
             case 1:
-                container[key] = rng.choice(rng.choice(places)[:1])
-                container[key] = json.loads(json.dumps(container[key], default=str)) if container[key] is not container else {}
+                other, place = rng.choice(places)
+                container[key] = copy.deepcopy(other[place])
             case 2:
                 del container[key]
 
@@ -316,7 +319,7 @@ def main() -> int:
             traceback.print_exc()
             return 1
         return 0
-    print("| sample | bytes | mutated files | taken | slowest ms | memory grown by MiB | seconds |\n| --- | --- | --- | --- | --- | --- | --- |", flush=True)
+    print("| sample | bytes | mutated files | taken | slowest ms | memory grown by MiB | seconds |\n" + "| --- " * 7 + "|", flush=True)
     failed = 0
     for i, suffix in enumerate(suffixes):
         if suffix.endswith(options.format):

@@ -108,7 +108,7 @@ def write_compressed_ply(path: str | os.PathLike[str], gaussians: Gaussians) -> 
     rotation = _packed(small / math.sqrt(2) + 0.5, ROTATION_BITS) | largest.astype(np.int64) << 30
     color = np.concatenate([codes[2], opacities_of(fields.logits[order])[:, None]], axis=1)
     rows = np.stack([_packed(codes[0], POINT_BITS), rotation, _packed(codes[1], POINT_BITS), _packed(color, COLOR_BITS)], axis=1)
-    rest = fields.sh_rest[order].transpose(0, 2, 1).reshape(count, -1)
+    rest = fields.sh_rest[order].transpose(0, 2, 1).reshape(count, 3 * fields.sh_rest.shape[1])
     shades = np.floor(256 * (rest / SH_RANGE + 0.5)).clip(0, 255).astype("u1")
 
     elements = [("chunk", len(starts), "float", BOUNDS), ("vertex", count, "uint", WORDS)]

@@ -49,7 +49,7 @@ class Fields:
         quaternion), and so are coefficients beyond `max_degree`. Quaternions are normalised, logits clamped to +-16.
         """
         means, quats, log_scales, logits, sh0, sh_rest = (_array(getattr(gaussians, name)) for name in Gaussians.NAMES)
-        finite = [np.isfinite(values).reshape(len(means), -1).all(1) for values in (means, quats, sh0, sh_rest)]
+        finite = [np.isfinite(values).all(tuple(range(1, values.ndim))) for values in (means, quats, sh0, sh_rest)]
         lengths = np.linalg.norm(quats.astype(np.float64), axis=1, keepdims=True)     # float32 would overflow at 1e19
         keep = np.logical_and.reduce([*finite, lengths[:, 0] > 0, ~np.isnan(log_scales).any(1), ~np.isnan(logits)])
         if not keep.all():

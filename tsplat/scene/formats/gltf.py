@@ -28,6 +28,7 @@ MAGIC, POINTS, FLOAT, BYTE = b"glTF", 0, 5126, 5121
 COMPONENTS = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", FLOAT: "<f4"}
 WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MAX_DEGREE = 3
+MAX_PARTS = 1000                            # primitives of splats: each takes about 1 ms, and a few bytes of JSON name it again
 MIN_SPLAT = 3                               # bytes that a splat takes in a file at least, to bound what a small file can ask for
 TOLERANCE = 1e-4                            # relative, of what a node's matrix may deviate from a rotation and a scale
 
@@ -69,6 +70,8 @@ def read_glb(path: str | os.PathLike[str]) -> Gaussians:
             fields = _read_primitive(document, binary, primitive, budget)
             budget -= len(fields)
             parts.append((node, fields, matrix))
+            if len(parts) > MAX_PARTS:
+                raise node.wrong(f"expected at most {MAX_PARTS} primitives of splats in the scene")
     if not parts:
         raise malformed(path, document.offset, f"expected a primitive with the extension {EXTENSION} in the scene; found none")
     logarithms = any(bool((fields.log_scales < 0).any()) for _, fields, _ in parts)
@@ -227,7 +230,7 @@ def _read_accessor(document: Json, binary: Reader, accessor: Json, kind: str) ->
     if view.get("extensions", dict, {}):
         raise view.wrong(f"compressed buffers are not supported; found {', '.join(view.value['extensions'])}")
     buffer = document.at("buffers").at(view.get("buffer", int))
-    if buffer.value != document.get("buffers", list)[0] or "uri" in buffer._checked(dict).value:
+    if view.value["buffer"] != 0 or buffer.get("uri", object, None) is not None:
         raise view.wrong("expected a view of buffer 0, which is in the .glb file")
     start, size = view.get("byteOffset", int, 0), view.get("byteLength", int)
     row = dtype.itemsize * width
@@ -247,8 +250,9 @@ def _read_accessor(document: Json, binary: Reader, accessor: Json, kind: str) ->
 def _placed(node: Json, fields: Fields, matrix: NDArray[np.float64], logarithms: bool, degree: int) -> Fields:
     """The splats in the world, with coefficients up to `degree`."""
     linear = matrix[:3, :3]
-    scale = float(np.cbrt(np.linalg.det(linear))) if np.isfinite(matrix).all() else 0.0
-    if not (0 < scale < math.inf) or not np.allclose(linear @ linear.T, scale ** 2 * np.eye(3), rtol=0, atol=TOLERANCE * scale ** 2):
+    with np.errstate(over="ignore"):
+        scale = float(np.cbrt(np.linalg.det(linear))) if np.isfinite(matrix).all() else 0.0
+    if not 0 < scale < math.inf or not np.allclose(linear @ linear.T, scale ** 2 * np.eye(3), rtol=0, atol=TOLERANCE * scale ** 2):
         raise node.wrong("expected a matrix that moves, turns and scales all axes alike, as splats cannot be sheared or mirrored")
     log_scales = (fields.log_scales if logarithms else log_scales_of(fields.log_scales)) + np.float32(math.log(scale))
     missing = (degree + 1) ** 2 - (fields.degree + 1) ** 2

@@ -31,7 +31,7 @@ TOOLS = Path(triton.__file__).parent / "backends/nvidia/bin"
 TARGETS = {**{f"sm_{n}": GPUTarget("cuda", n, 32) for n in (80, 86, 89, 90, 100, 120)},
            "gfx942": GPUTarget("hip", "gfx942", 64), "gfx1100": GPUTarget("hip", "gfx1100", 32)}
 REGISTERS, WARPS = 65536, 64
-PIXELS_PER_THREAD = {"blend_fwd_kernel": 8, "blend_bwd_kernel": 8}
+PIXELS_PER_THREAD = dict.fromkeys(("blend_fwd_kernel", "blend_bwd_kernel", "sphere_fwd_kernel", "sphere_bwd_kernel"), 8)
 
 
 class _Driver:
@@ -72,7 +72,7 @@ def compile_only(target: GPUTarget) -> Iterator[list[Any]]:
 
 def launch_everything(quick: bool) -> Iterator[tuple[str, Any]]:
     """Each launch, with the name of its variant; `quick` gives one or two variants of each kernel."""
-    from tsplat.kernels import adam, binning, blending, harmonics, projection
+    from tsplat.kernels import adam, binning, blending, harmonics, projection, spheres
 
     C, N, W, H = 2, 1000, 640, 480
 
@@ -106,6 +106,21 @@ def launch_everything(quick: bool) -> Iterator[tuple[str, Any]]:
         yield label, lambda c=colors, D=D: blending.blend(*splats, c, t(C, D), ids, offsets, W, H, 8, 0.99, False)
         yield label, lambda c=colors, D=D, i=images, a=absgrad: blending.blend_backward(
             *splats, c, t(C, D), ids, offsets, *i, *i, W, H, 8, 0.99, False, a)
+    geometry, tiles = (t(C, N, 3), t(1, N), t(C, 3, 3)), t(C * 80 * 60, dtype=torch.int32)
+    plain, full = ("pinhole", False, False), ("pinhole", True, True)
+    variants = [(3, *plain), (32, *plain)] if quick else [(D, *plain) for D in (1, 3, 4, 32, 128)] + [(3, "orthographic", False, False),
+                                                                                                     (4, *full), (32, *full)]
+    for D, model, chord, everything in variants:
+        label = f"{D} channels{'' if model == 'pinhole' else ', ' + model}{', chord, depth, cutoff, intrinsics' if everything else ''}"
+        inputs = geometry[0], geometry[1], t(1, N), t(1, N, D), t(C, D), t(), geometry[2], ids, offsets
+        images, options = (t(C, H, W, D), t(C, H, W), t(C, H, W), tiles), (W, H, 8, model, 0.1, 9.0, 1e-6, chord)
+        yield label, lambda i=inputs, o=options, e=everything: spheres.blend_spheres(*i, *o, e, 1e-4)
+        yield label, lambda i=inputs, o=options, e=everything, m=images: spheres.blend_spheres_backward(
+            *i, m[1] if e else None, m, m[0], m[1] if e else None, m[2], *o, e)
+    for model in ("pinhole",) if quick else ("pinhole", "orthographic"):
+        yield model, lambda m=model: spheres.outlines(*geometry, W, H, m, 0.1, 9.0)
+        for count in (5,) if quick else (1, 5, 6):
+            yield f"{model}, {count}", lambda n=count, m=model: spheres.nearest_hits(*geometry, ids, offsets, n, W, H, 8, m, 0.1, 9.0, False)
 
 
 class Usage(NamedTuple):

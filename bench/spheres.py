@@ -187,6 +187,8 @@ def draw(rows: list[dict[str, Any]], clock: str, title: str, path: Path) -> None
     for name, marker in (("forward", "o"), ("backward", "s")):
         axes.loglog(spheres, [1e3 * row[name][clock] for row in rows], marker=marker, label=name)
     axes.set(xlabel="spheres", ylabel="CPU time of all threads, ms" if clock == "cpu" else "ms", title=title)
+    decades = [math.log10(1e3 * row[name][clock]) for row in rows for name in ("forward", "backward")]
+    axes.set_ylim(10 ** math.floor(min(decades)), 10 ** math.ceil(max(decades)))
     axes.grid(True, which="both", alpha=0.3)
     axes.legend()
     figure.savefig(path, dpi=100)

@@ -26,6 +26,8 @@ def test_no_kernel_spills(target: str, tmp_path: Path) -> None:
     kernels = json.loads(run.stdout)
     names = {k["kernel"] for k in kernels}
     assert {"blend_fwd_kernel", "blend_bwd_kernel", "feature_fwd_kernel", "feature_bwd_kernel", "count_kernel", "emit_kernel"} <= names
+    assert {"outlines_kernel", "sphere_fwd_kernel", "sphere_bwd_kernel", "sphere_feature_fwd_kernel", "sphere_feature_bwd_kernel",
+            "sphere_features_bwd_kernel", "nearest_kernel"} <= names
     assert any("project" in n for n in names)
     assert "adam_rows_kernel" in names
     assert any("harmonics" in n for n in names)

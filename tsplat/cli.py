@@ -20,7 +20,7 @@ from tsplat.camera import Camera
 from tsplat.fit import FitConfig, Quality, draw, evaluate, fit
 from tsplat.fit.evaluation import mean_quality
 from tsplat.fit.output import metrics_of, read_config, write_json
-from tsplat.scene import Gaussians, load_capture, write_image, write_synthetic_capture
+from tsplat.scene import Gaussians, Spheres, load_capture, load_scene, write_image, write_synthetic_capture
 from tsplat.scene.formats import FORMATS, find_format, is_sog
 
 INTERRUPTED = 130                    # the exit status of a shell's command that was stopped by Ctrl-C
@@ -178,11 +178,12 @@ def _config(options: argparse.Namespace, path: Path | None) -> FitConfig:
 def _eval(options: argparse.Namespace) -> None:
     beside = options.scene.with_name("config.json")
     config = _config(options, beside if beside.is_file() else None)
-    gaussians = Gaussians.load(options.scene).to(_device(options.device))
+    scene = load_scene(options.scene).to(_device(options.device))
+    config = dataclasses.replace(config, primitive="spheres" if isinstance(scene, Spheres) else "gaussians")
     capture = load_capture(options.data, downscale=config.downscale, test_every=config.test_every)
     if not capture.test:
         raise ValueError(f"{options.data}: expected held-out photos; there are none with test_every = {config.test_every}")
-    qualities = evaluate(gaussians, capture, capture.test, config)
+    qualities = evaluate(scene, capture, capture.test, config)
     for name, quality in qualities.items():
         print(f"{name}: PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}")
     _print_mean(qualities)
@@ -198,19 +199,23 @@ def _print_mean(qualities: dict[str, Quality]) -> None:
 
 def _render(options: argparse.Namespace) -> None:
     device = _device(options.device)
-    gaussians = Gaussians.load(options.scene)
+    scene = load_scene(options.scene)
     if options.camera is not None:
         cameras = [_capture_camera(options.camera, options.index, options.size)]
     else:
-        cameras = _framing_cameras(gaussians.means, 1 if options.orbit is None else options.orbit, AXES[options.up],
+        centres = scene.positions if isinstance(scene, Spheres) else scene.means
+        cameras = _framing_cameras(centres, 1 if options.orbit is None else options.orbit, AXES[options.up],
                                    options.size or SIZE, options.fov)
     out: Path = options.out
     out.parent.mkdir(parents=True, exist_ok=True)
     background = torch.full((3,), float(options.background == "white"), device=device)
-    gaussians.to(device)
+    scene.to(device)
     for i, camera in enumerate(cameras):
         with torch.no_grad():
-            image = draw(gaussians, camera.to(device), background, antialiased=options.antialiased).image
+            if isinstance(scene, Spheres):
+                image = scene.render(camera.to(device), background=background).image
+            else:
+                image = draw(scene, camera.to(device), background, antialiased=options.antialiased).image
         path = out if options.orbit is None else out.with_name(f"{out.stem}_{i:03d}{out.suffix}")
         write_image(path, image)
         print(path)
@@ -270,18 +275,21 @@ def _info(options: argparse.Namespace) -> None:
 
 
 def _print_scene(path: Path) -> None:
-    gaussians = Gaussians.load(path)
-    print(f"format   {find_format(path).name}")
-    print(f"splats   {len(gaussians)}, spherical harmonics of degree {gaussians.sh_degree}")
-    finite = torch.stack([p.detach().flatten(1).isfinite().all(1) if p.ndim > 1 else p.isfinite() for p in gaussians.parameters()])
+    scene = load_scene(path)
+    if isinstance(scene, Spheres):
+        print(f"spheres  {len(scene)}, {scene.features.shape[1]} channels, gamma {scene.gamma:g}, near {scene.near:g}, far {scene.far:g}")
+        rows = {**dict(zip("xyz", scene.positions.unbind(1), strict=True)), "opacity": scene.opacities, "radius": scene.radii}
+    else:
+        print(f"format   {find_format(path).name}")
+        print(f"splats   {len(scene)}, spherical harmonics of degree {scene.sh_degree}")
+        rows = {**dict(zip("xyz", scene.means.unbind(1), strict=True)), "opacity": scene.opacities, "scale": scene.scales.amax(1)}
+    finite = torch.stack([p.detach().flatten(1).isfinite().all(1) if p.ndim > 1 else p.isfinite() for p in scene.parameters()])
     good = finite.all(0)
     if not bool(good.all()):
         print(f"         {int((~good).sum())} of them with NaN or infinity, left out below")
     if not bool(good.any()):
         return
     print(f"{'':9}" + "".join(f"{f'{q:.0%}':>11}" for q in QUANTILES))
-    rows = {**dict(zip("xyz", gaussians.means.unbind(1), strict=True)), "opacity": gaussians.opacities,
-            "scale": gaussians.scales.amax(1)}
     for name, values in rows.items():
         print(f"{name:9}" + "".join(f"{value:11.4g}" for value in _quantiles(values.detach()[good], QUANTILES)))
 

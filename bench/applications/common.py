@@ -31,6 +31,7 @@ def arguments(doc: str | None, picture: str, **options: float) -> argparse.Argum
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("TSPLAT_DATA", ROOT.parent / "shared")) / "data",
                         help="folder of the data sets (default: data in the folder TSPLAT_DATA)")
     parser.add_argument("--picture", type=Path, default=PICTURES / picture, help="the picture to write")
+    parser.add_argument("--targets", action="store_true", help="show the views, too: above, in the picture (for data that may be copied only)")
     parser.add_argument("--seed", type=int, default=0)
     for name, default in options.items():
         parser.add_argument("--" + name.replace("_", "-"), type=type(default), default=default, help=f"default {default}")
@@ -214,8 +215,9 @@ def mean_psnr(draw: Callable[[tsplat.Camera], Tensor], views: Views) -> float:
     return sum(psnr(draw(camera), image) for camera, image in views.each()) / len(views)
 
 
-def write_rows(path: Path, rows: Iterable[Iterable[Tensor]]) -> None:
-    """Images `[H, W, 1 or 3]` of one size, row by row, as a PNG."""
+def write_rows(path: Path, rows: Iterable[Iterable[Tensor]], targets: Iterable[Tensor] | None = None) -> None:
+    """Images `[H, W, 1 or 3]` of one size, row by row, as a PNG; above them, the targets, if they are to be shown."""
+    rows = rows if targets is None else [targets, *rows]
     write_image(path, torch.cat([torch.cat([image.expand(-1, -1, 3) for image in row], 1) for row in rows]).clamp(0, 1))
 
 

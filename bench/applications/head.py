@@ -3,7 +3,7 @@
     python bench/applications/head.py
 
 50 views of a bust over a blue background, which none of its colours is near to, and 10 held out. Prints the number of spheres and the held-out PSNR
-after each stage. The picture: held-out views above, the spheres below, from the volume to the last refinement in the first column's view.
+after each stage. The picture: the spheres in four of the held-out views.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def main(argv: list[str] | None = None) -> Result:
     some = test[torch.tensor([0, 3, 6, 9])]
     with torch.no_grad():
         images = [stage.render(result.spheres, camera, FINE_GAMMA[1]) for camera, _ in some.each()]
-    write_rows(args.picture, [some.images, images])
+    write_rows(args.picture, [images], some.images if args.targets else None)
     report(start, args.picture)
     return result
 

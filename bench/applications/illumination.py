@@ -79,15 +79,16 @@ def chamfer(a: Tensor, b: Tensor) -> float:
     return float(ab + ba) / 2
 
 
-def seen(spheres: Spheres, stage: Stage, views: Views) -> Tensor:
+def seen(spheres: Spheres, stage: Stage, views: Views, gamma: float) -> Tensor:
     """Which spheres weigh more than a fiftieth of a pixel in the mean view `[N]`."""
-    weights = visibility(spheres.positions, spheres.radii, spheres.opacities, [views.cameras], gamma=GAMMA[1], **stage.planes)
+    weights = visibility(spheres.positions, spheres.radii, spheres.opacities, [views.cameras], gamma=gamma, **stage.planes)
     return weights > 0.02 * len(views)
 
 
 def visible_sides(spheres: Spheres, stage: Stage, views: Views) -> Tensor:
     """Where the spheres that are seen end in the direction of their normals."""
-    return (spheres.positions + spheres.radii[:, None] * normalize(spheres.features[:, :3], dim=1))[seen(spheres, stage, views)]
+    return (spheres.positions + spheres.radii[:, None] * normalize(spheres.features[:, :3], dim=1))[
+        seen(spheres, stage, views, SHARP)]
 
 
 def with_alpha(normals: Tensor) -> Tensor:
@@ -97,7 +98,7 @@ def with_alpha(normals: Tensor) -> Tensor:
 
 def main(argv: list[str] | None = None) -> tuple[float, float]:
     """Optimise, print and draw."""
-    parser = arguments(__doc__, "illumination.png", steps=240, rounds=4, batch=4, spheres=3000, samples=20_000, cameras=144, size=128)
+    parser = arguments(__doc__, "illumination.png", steps=200, rounds=4, batch=4, spheres=3000, samples=20_000, cameras=144, size=128)
     parser.add_argument("--mesh", default="cow.obj", help="a file of triangles in the data's folder `meshes`")
     args = parser.parse_args(argv)
     start, generator = time.process_time(), torch.Generator().manual_seed(args.seed)
@@ -105,8 +106,9 @@ def main(argv: list[str] | None = None) -> tuple[float, float]:
     surface = sample(*read_obj(args.data / "meshes" / args.mesh), args.samples, generator)
     eyes = DISTANCE * normalize(torch.randn(args.cameras, 3, generator=generator), dim=1)
     cameras = orbit(eyes, args.size, FOV)
-    dense = Spheres(surface.points, torch.full((args.samples,), 4 / math.sqrt(args.samples)), with_alpha(surface.normals),
-                    torch.full((args.samples,), 0.9999))
+    radius = 4 / math.sqrt(args.samples)
+    dense = Spheres(surface.points - radius * surface.normals, torch.full((args.samples,), radius), with_alpha(surface.normals),
+                    torch.full((args.samples,), 0.9999))                                    # they touch the surface from within
     with torch.no_grad():
         views = Views(cameras, shade(torch.stack([stage.render(dense, cameras[i], SHARP) for i in range(args.cameras)])))
 
@@ -121,7 +123,7 @@ def main(argv: list[str] | None = None) -> tuple[float, float]:
         return (shade(render(spheres, some.cameras, gamma)) - some.images).abs().mean()
 
     def alive(spheres: Spheres) -> Tensor:
-        return seen(spheres, stage, views) & (spheres.opacities > 0.1)
+        return seen(spheres, stage, views, GAMMA[1]) & (spheres.opacities > 0.1)
 
     shown = views.cameras[:5]
     with torch.no_grad():
@@ -135,7 +137,7 @@ def main(argv: list[str] | None = None) -> tuple[float, float]:
     print(f"illumination: {args.spheres} spheres, {len(sides)} of them seen in the end, {args.cameras} views of {args.size}x{args.size}, "
           f"{args.steps} steps, Chamfer distance {before:.4f} before, {after:.4f} after")
     normals = (normalize(last[..., :3], dim=-1) / 2 + 0.5) * (last[..., 3:] > 0.5)
-    write_rows(args.picture, [views.images[:5], shade(first), shade(last), normals])
+    write_rows(args.picture, [shade(first), shade(last), normals], views.images[:5])
     report(start, args.picture)
     return before, after
 

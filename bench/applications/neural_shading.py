@@ -4,8 +4,8 @@
 
 The geometry is that of `head.py`, of which the result is read, or made if it is not there yet, and it stays. The first three channels start as the
 colours, and the network adds to them what it makes of all channels, at first nothing. L1 only (the paper has a perceptual and an
-adversarial loss, too). Prints the held-out PSNR of the head's colours, of these after as many steps more, and of the network. The picture:
-held-out views, plain colours, the network's, and three of the other channels.
+adversarial loss, too). Prints the held-out PSNR of the head's colours, of these after as many steps more, and of the network. The picture, in
+held-out views: plain colours, the network's, and three of the other channels.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Decoder(nn.Module):
 
 def main(argv: list[str] | None = None) -> tuple[float, float, float]:
     """Optimise the colours, then features and network, print and draw."""
-    parser = arguments(__doc__, "neural_shading.png", steps=300, batch=2, downscale=2.0)
+    parser = arguments(__doc__, "neural_shading.png", steps=300, batch=1, downscale=2.0)
     parser.add_argument("--spheres", type=Path, default=ROOT / "out" / "head.pt", help="what head.py wrote (default: out/head.pt)")
     args = parser.parse_args(argv)
     if not args.spheres.is_file():
@@ -60,7 +60,7 @@ def main(argv: list[str] | None = None) -> tuple[float, float, float]:
         stage = head.stage_of_head(channels)
         extra = 0.1 * torch.randn(len(spheres), channels - 3, generator=generator)
         featured = spheres.with_features(torch.cat([spheres.features.detach(), extra], 1))
-        groups = [{"params": [featured.features], "lr": 1e-2}, {"params": list(decoder.parameters()), "lr": 2e-3}]
+        groups = [{"params": [featured.features], "lr": 2e-2}, {"params": list(decoder.parameters()), "lr": 5e-3}]
 
         def loss(some: Views, gamma: float) -> Tensor:
             return (decoder(stage.render(featured, some.cameras, gamma)) - some.images).abs().mean()
@@ -85,7 +85,8 @@ def main(argv: list[str] | None = None) -> tuple[float, float, float]:
     with torch.no_grad():
         some = test[torch.tensor([0, 3, 6, 9])]
         images = [(colors[0].render(colors[1], camera, GAMMA), features[0].render(features[1], camera, GAMMA)) for camera, _ in some.each()]
-        write_rows(args.picture, [some.images, [a for a, _ in images], [network(b) for _, b in images], [b[..., 3:6] + 0.5 for _, b in images]])
+        rows = [a for a, _ in images], [network(b) for _, b in images], [b[..., 3:6] + 0.5 for _, b in images]
+        write_rows(args.picture, rows, some.images if args.targets else None)
     report(start, args.picture)
     return before, longer, after
 

@@ -11,9 +11,9 @@ from torch import Tensor
 
 from tsplat.fit.spheres import visibility, worth_keeping
 
-GAMMA = 0.1, 3e-3
+GAMMA = 0.5, 1e-2
 """Of the volume. Finer stages start where it ends, but for a little softness with which the new spheres sort themselves."""
-FINE_GAMMA = 1e-2, 1e-3
+FINE_GAMMA = 5e-2, 1e-3
 COLOR_DISTANCE = 0.15
 LEAST_WEIGHT = 0.5          # pixels of all views together
 

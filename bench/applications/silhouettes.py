@@ -4,7 +4,7 @@
 
 SoftRas's airplane: 120 silhouettes of 64x64 pixels, of which every eighth is held out. The start is SoftRas's: a cube of 15x15 squares a side,
 blown up to a sphere, 1352 vertices. Spheres that the loss makes vanish are put beside others a few times. Prints the mean intersection
-over union of held-out silhouettes. The picture: held-out silhouettes, what the spheres make of them, and the spheres, shaded by depth.
+over union of held-out silhouettes. The picture: what the spheres make of these, and the spheres, shaded by depth.
 """
 
 from __future__ import annotations
@@ -78,19 +78,20 @@ def main(argv: list[str] | None = None) -> float:
         images = stage.render(spheres, test.cameras, GAMMA[1])
         score = sum(map(iou, images, test.images)) / len(test)
         print(f"silhouettes: {n} spheres, {args.steps} steps, held-out IoU {score:.4f} of {len(test)} views")
-        draw(args.picture, stage, spheres, test[torch.arange(0, len(test), 2)[:6]])
+        draw(args.picture, stage, spheres, test[torch.arange(0, len(test), 2)[:6]], args.targets)
     report(start, args.picture)
     return score
 
 
-def draw(path: Path, stage: Stage, spheres: Spheres, views: Views) -> None:
-    """Three rows: targets, silhouettes, and the spheres with a sharp gamma, shaded by depth, at twice the size."""
+def draw(path: Path, stage: Stage, spheres: Spheres, views: Views, targets: bool) -> None:
+    """Two rows: silhouettes, and the spheres with a sharp gamma, shaded by depth, at twice the size."""
     silhouettes = stage.render(spheres, views.cameras, GAMMA[1])
     r = tsplat.render_spheres(spheres.positions, spheres.features, spheres.radii, views.cameras, background=torch.zeros(1), gamma=1e-3,
                               depth="expected", **stage.planes)
     shade = (stage.planes["far"] - r.depth) / (2 * stage.radius) * r.alpha
-    rows = views.images, silhouettes, shade[..., None]
-    write_rows(path, [[image.repeat_interleave(2, 0).repeat_interleave(2, 1) for image in row] for row in rows])
+    *rows, above = ([image.repeat_interleave(2, 0).repeat_interleave(2, 1) for image in row]
+                    for row in (silhouettes, shade[..., None], views.images))
+    write_rows(path, rows, above if targets else None)
 
 
 if __name__ == "__main__":

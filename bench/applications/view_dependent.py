@@ -4,8 +4,8 @@
 
 The chair of the NeRF paper at 100x100 over a blue background: 100 views, and 13 held out. A random volume is reconstructed as in `head.py`.
 From there, plain colours go on, and, for as many steps, colours with five features more, to which a fully connected network, the same for
-all pixels, adds what it makes of features and viewing direction. Prints the held-out PSNR of both. The picture: held-out views, plain
-colours, the network's.
+all pixels, adds what it makes of features and viewing direction. Prints the held-out PSNR of both. The picture, in held-out views:
+plain colours, the network's.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class Plain(nn.Module):
 
 def main(argv: list[str] | None = None) -> tuple[float, float]:
     """Reconstruct, go on in both ways, print and draw."""
-    parser = arguments(__doc__, "view_dependent.png", steps=200, batch=1, volume=4000, refinements=1, downscale=4.0, reach=1.0)
+    parser = arguments(__doc__, "view_dependent.png", steps=250, batch=1, volume=4000, refinements=2, downscale=4.0, reach=1.0)
     args = parser.parse_args(argv)
     start, generator = time.process_time(), torch.Generator().manual_seed(args.seed)
     torch.manual_seed(args.seed)                                                            # of the network's weights
@@ -94,7 +94,7 @@ def main(argv: list[str] | None = None) -> tuple[float, float]:
     with torch.no_grad():
         rows = [[shader(stage.render(spheres, camera, GAMMA[1]), camera) for camera, _ in some.each()]
                 for shader, (stage, spheres, _) in zip(shaders, results, strict=True)]
-    write_rows(args.picture, [some.images, *rows])
+    write_rows(args.picture, rows, some.images if args.targets else None)
     report(start, args.picture)
     return without, with_
 

@@ -60,8 +60,6 @@ def hit_weights(centers: Tensor, radii: Tensor, opacities: Tensor, gamma: Tensor
     Args: as those of `blend_spheres`, and its logsumexp.
     """
     C, H, W, n = hits.shape
-    if not centers.shape[1]:                            # nothing to gather from
-        return centers.new_full(hits.shape, torch.inf), centers.new_zeros(hits.shape)
     is_hit = hits >= 0
     index = torch.where(is_hit, hits, centers.shape[1]).long().view(C, -1)                  # of a sphere of zeros where there is none
 

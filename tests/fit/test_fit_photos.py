@@ -72,7 +72,7 @@ def test_photos_of_different_exposure(capture: Capture, config: Make) -> None:
     level = [0.6 if i % 2 else 1.0 for i in range(len(capture))]
     mean = sum(level[i] for i in capture.train) / len(capture.train)
     capture.images = [image * (mean if i in capture.test else level[i]) for i, image in enumerate(images)]      # type: ignore[assignment]
-    plain, fitted = (fit(capture, config(steps=60, exposure=e, lr_exposure=1e-2), progress=False).mean for e in (False, True))
+    plain, fitted = (fit(capture, config(steps=60, density="none", exposure=e, lr_exposure=1e-2), progress=False).mean for e in (False, True))
     assert plain is not None
     assert fitted is not None
     assert fitted.psnr > plain.psnr + 0.2
@@ -81,13 +81,13 @@ def test_photos_of_different_exposure(capture: Capture, config: Make) -> None:
 def test_poses_that_are_off(capture: Capture, config: Make, tmp_path: Path) -> None:
     generator = torch.Generator().manual_seed(0)
     for i in range(len(capture)):
-        increment = 0.01 * torch.randn(6, generator=generator)
+        increment = 0.02 * torch.randn(6, generator=generator)
         capture.viewmats[i] = moved(capture.camera(i), increment, 1.0).viewmats
-    c = config(steps=40, refine_poses=True, lr_poses=3e-4, pose_steps=20)
+    c = config(steps=40, density="none", refine_poses=True, lr_poses=1e-3, pose_steps=20)
     result = fit(capture, c, tmp_path, progress=False)
     assert result.mean is not None
     assert result.refined_mean is not None
-    assert result.refined_mean.psnr > result.mean.psnr + 0.3
+    assert result.refined_mean.psnr > result.mean.psnr + 0.5
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics["mean_with_refined_poses"]["psnr"] == result.refined_mean.psnr
     assert metrics["mean"]["psnr"] == result.mean.psnr

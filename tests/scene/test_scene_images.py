@@ -1,6 +1,7 @@
 """Image files and the store: alpha, masks, sizes, the bound on memory, broken files."""
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -156,3 +157,15 @@ def test_store_keeps_within_its_bound(tmp_path: Path, ramp: Ramp, monkeypatch: p
     assert small.held_bytes == 0
     with pytest.raises(ValueError, match="cache_bytes"):
         ImageStore(photos, cache_bytes=-1)
+
+
+def test_store_keeps_within_its_bound_for_several_threads(tmp_path: Path) -> None:
+    photos = []
+    for i in range(4):
+        write_image(tmp_path / f"{i}.png", torch.full((6, 8, 3), i / 255))
+        photos.append(Photo(tmp_path / f"{i}.png", 8, 6))
+    store = ImageStore(photos, cache_bytes=2 * 6 * 8 * 3)
+    with ThreadPoolExecutor(4) as pool:
+        values = list(pool.map(lambda i: round(255 * float(store[i % 4].mean())), range(200)))
+    assert values == [i % 4 for i in range(200)]
+    assert store.held_bytes == 2 * 6 * 8 * 3

@@ -39,7 +39,7 @@ def evaluate(gaussians: Scene, capture: Capture, views: Sequence[int], config: F
     Returns:
         The quality by the photo's name.
     """
-    device = gaussians.means.device
+    device = gaussians.device
     background = fixed_background(config).to(device)
     primitive, qualities = primitive_of(config), {}
     for view in views:
@@ -57,7 +57,7 @@ def refined_cameras(gaussians: Scene, capture: Capture, views: Sequence[int], co
 
     For fits that refine poses, where those of held-out photos would be left behind.
     """
-    primitive, device = primitive_of(config), gaussians.means.device
+    primitive, device = primitive_of(config), gaussians.device
     background = fixed_background(config).to(device)
     cameras = {}
     gaussians.requires_grad_(False)

@@ -15,7 +15,17 @@ PARALLEL = 1e-3      # weight of a guess against the optical axes: it decides on
 
 
 def initial_gaussians(capture: Capture, config: FitConfig, generator: torch.Generator) -> Gaussians:
-    """Round Gaussians as in 3DGS (section 5.1): at the sparse points, in their colours, or random without points.
+    """Round Gaussians at the `initial_points`, as in 3DGS (section 5.1)."""
+    splats = Gaussians.from_points(*initial_points(capture, config, generator), config.sh_degree)
+    with torch.no_grad():
+        opacity = config.published("init_opacity")
+        splats.opacity_logits.fill_(math.log(opacity / (1 - opacity)))
+        splats.log_scales.add_(math.log(config.published("init_scale")))
+    return splats
+
+
+def initial_points(capture: Capture, config: FitConfig, generator: torch.Generator) -> tuple[Tensor, Tensor | None]:
+    """Where splats start, `[N, 3]`, and their colours `[N, 3]`, or None for grey: the capture's sparse points, or random ones.
 
     With fewer points than `config.splats`, the cloud is filled up by `fill_up`. Without points, `config.splats` random
     ones lie in the cube of `view_cube`. There are never more than `config.max_splats`, if that is given: of more points, some
@@ -24,20 +34,13 @@ def initial_gaussians(capture: Capture, config: FitConfig, generator: torch.Gene
     most = config.max_splats or math.inf
     count = int(min(config.splats, most))
     if capture.points is None or not len(capture.points):
-        low, high = view_cube(capture)
-        splats = Gaussians.random(count, low, high, config.sh_degree, generator)
-    else:
-        points, colors = capture.points, capture.point_colors
-        if len(points) > most:
-            chosen = torch.randperm(len(points), generator=generator)[:config.max_splats]
-            points, colors = points[chosen], None if colors is None else colors[chosen]
-        points, colors = fill_up(points, colors, count, generator)
-        splats = Gaussians.from_points(points, colors, config.sh_degree)
-    with torch.no_grad():
-        opacity = config.published("init_opacity")
-        splats.opacity_logits.fill_(math.log(opacity / (1 - opacity)))
-        splats.log_scales.add_(math.log(config.published("init_scale")))
-    return splats
+        low, high = (torch.tensor(corner) for corner in view_cube(capture))
+        return low + (high - low) * torch.rand(count, 3, generator=generator), torch.rand(count, 3, generator=generator)
+    points, colors = capture.points, capture.point_colors
+    if len(points) > most:
+        chosen = torch.randperm(len(points), generator=generator)[:config.max_splats]
+        points, colors = points[chosen], None if colors is None else colors[chosen]
+    return fill_up(points, colors, count, generator)
 
 
 def fill_up(points: Tensor, colors: Tensor | None, count: int, generator: torch.Generator) -> tuple[Tensor, Tensor | None]:

@@ -6,13 +6,11 @@ the 3DGS code does, so that figures compare with its and images of any size have
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, interpolate
-
-from tsplat.rasterize import Meta
 
 WINDOW = 11
 SIGMA = 1.5
@@ -72,7 +70,17 @@ def depth_loss(depth: Tensor, alpha: Tensor, truth: Tensor) -> Tensor:
     return (error.abs() * known).sum() / known.sum().clamp(min=1)
 
 
-def scene_regulariser(opacities: Tensor, scales: Tensor, meta: Meta, extent: float, *, opacity: float, scale: float,
+class Seen(Protocol):
+    """What is known of a rendering: which splats were visible, bool `[C, N]`, and their camera z, `[C, N]`."""
+
+    @property
+    def visible(self) -> Tensor: ...
+
+    @property
+    def depths(self) -> Tensor: ...
+
+
+def scene_regulariser(opacities: Tensor, scales: Tensor, meta: Seen, extent: float, *, opacity: float, scale: float,
                       opacity_depth: float) -> Tensor | None:
     """The weighted sum of what the loss has besides the photo, or None without any weight.
 

@@ -56,4 +56,3 @@ class PhotoParameters(nn.Module):
         assert seen is not None
         seen[photo] = True
         self.adam.step(seen)
-        self.adam.zero_grad()

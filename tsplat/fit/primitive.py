@@ -15,10 +15,12 @@ from tsplat.fit.initial import initial_gaussians
 from tsplat.fit.losses import scene_regulariser
 from tsplat.fit.optimiser import learning_rates
 from tsplat.fit.schedules import density_schedule, reset_interval, sh_degree_at
+from tsplat.fit.sphere_primitive import SphereDrawing, SpherePrimitive
 from tsplat.rasterize import Rendering
 from tsplat.scene import Capture, Gaussians
 
-Scene: TypeAlias = Gaussians        # or whatever else a primitive makes: a module of parameters [N, ...], with `len` and `save`
+Scene: TypeAlias = Any              # what a primitive makes: `Splats` with `save` (`Gaussians`, `Spheres`)
+Drawing: TypeAlias = Rendering | SphereDrawing
 MAX_SPLATS = 1_000_000              # where a kind of density control without a budget ends
 
 
@@ -34,11 +36,11 @@ class Primitive(Protocol):
         ...
 
     def draw(self, scene: Scene, camera: Camera, background: Tensor, config: FitConfig, step: int | None = None, *, depth: bool = False,
-             probes: Mapping[str, Tensor] | None = None) -> Rendering:
+             probes: Mapping[str, Tensor] | None = None) -> Drawing:
         """Render as at `step`, or (None) as finished."""
         ...
 
-    def regulariser(self, scene: Scene, rendering: Rendering, config: FitConfig, extent: float) -> Tensor | None:
+    def regulariser(self, scene: Scene, rendering: Any, config: FitConfig, extent: float) -> Tensor | None:
         """What the loss has besides the photo."""
         ...
 
@@ -93,11 +95,5 @@ class GaussianPrimitive:
 
 
 def primitive_of(config: FitConfig) -> Primitive:
-    """The primitive that the config names.
-
-    Raises:
-        NotImplementedError: it cannot be fitted yet.
-    """
-    if config.primitive == "spheres":
-        raise NotImplementedError("primitive: 'spheres' cannot be fitted yet; expected 'gaussians'")
-    return GaussianPrimitive()
+    """The primitive that the config names."""
+    return SpherePrimitive() if config.primitive == "spheres" else GaussianPrimitive()

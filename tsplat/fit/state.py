@@ -49,7 +49,7 @@ class FitState:
     def of(cls, scene: Scene, capture: Capture, config: FitConfig, generator: torch.Generator) -> FitState:
         """The state before the first step."""
         control = primitive_of(config).control(config, capture.extent, len(scene))
-        photos = PhotoParameters(len(capture), config).to(scene.means.device)
+        photos = PhotoParameters(len(capture), config).to(scene.device)
         return cls(scene, make_adam(scene, visible_only=config.optimiser == "visible"), control, photos, generator)
 
     def next_view(self, views: Sequence[int]) -> int:

@@ -11,7 +11,7 @@ from tsplat.scene.images import ImageStore
 
 
 class PhotoStream:
-    """`images[i]`, of which the next can be asked for beforehand. One thread reads, so the store has one user.
+    """`images[i]`, of which the next can be asked for beforehand.
 
     A context manager: at the end of the block the thread ends.
     """

@@ -167,7 +167,7 @@ def train_step(state: FitState, capture: Capture, config: FitConfig, images: Pho
 
 def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStream | None) -> Step:
     scene, primitive, extent = state.gaussians, primitive_of(config), capture.extent
-    device = scene.means.device
+    device = scene.device
     view = state.next_view(capture.train)
     photo = (images or capture.images)[view].to(device)
     if images is not None and state.queue:
@@ -185,10 +185,11 @@ def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStr
     regulariser = primitive.regulariser(scene, rendering, config, extent)
     loss = loss if regulariser is None else loss + regulariser
     state.adam.zero_grad()
+    state.photos.zero_grad()
     loss.backward()                                       # type: ignore[no-untyped-call]
     _check_finite(float(loss.detach()), [scene, state.photos], f"step {state.step + 1}, photo {capture.names[view]}")
-    state.control.observe(rendering.meta, camera)
     check_growth(scene, state.control.growth(scene, state.step + 1), state.step + 1)
+    state.control.observe(rendering.meta, camera)
     set_rates(state.adam, primitive.rates(config, extent, state.step))
     adam_step(state.adam, rendering.meta.visible.any(0))
     state.photos.step(view, config, state.step)

@@ -48,7 +48,7 @@ def turntable(capture: Capture, frames: int) -> list[Camera]:
 @torch.no_grad()
 def write_turntable(path: Path, scene: Scene, capture: Capture, config: FitConfig, frames: int) -> None:
     """Write the turn as an animated GIF."""
-    device, primitive = scene.means.device, primitive_of(config)
+    device, primitive = scene.device, primitive_of(config)
     background = fixed_background(config).to(device)
     write_gif(path, [primitive.draw(scene, camera.to(device), background, config).image.cpu() for camera in turntable(capture, frames)], FPS)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -40,7 +41,7 @@ class ImageStore:
     """`store[i]` is photo i as float32 `[H, W, 3]` in 0..1, or `[H, W, 4]` with the file's alpha or the mask.
 
     Colours are not multiplied by alpha. Images are reduced by averaging areas, undistorted, and kept as uint8; the ones
-    used least recently are dropped, so that no more than `cache_bytes` bytes are held. Not for several threads at once.
+    used least recently are dropped, so that no more than `cache_bytes` bytes are held. Of several threads, one reads at a time.
 
     Raises:
         ValueError: from `store[i]`, naming the file, if it cannot be decoded.
@@ -53,6 +54,7 @@ class ImageStore:
         self.cache_bytes = cache_bytes
         self._cache: OrderedDict[int, Tensor] = OrderedDict()
         self._held = 0
+        self._lock = threading.Lock()
 
     def __len__(self) -> int:
         return len(self.photos)
@@ -63,7 +65,11 @@ class ImageStore:
         return self._held
 
     def __getitem__(self, index: int) -> Tensor:
-        index = range(len(self.photos))[index]
+        with self._lock:
+            image = self._read(range(len(self.photos))[index])
+        return image.to(torch.float32) / 255
+
+    def _read(self, index: int) -> Tensor:
         image = self._cache.get(index)
         if image is None:
             image = load_photo(self.photos[index])
@@ -74,7 +80,7 @@ class ImageStore:
                 self._held += image.nbytes
         else:
             self._cache.move_to_end(index)
-        return image.to(torch.float32) / 255
+        return image
 
 
 def load_photo(photo: Photo) -> Tensor:

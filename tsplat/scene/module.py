@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, ClassVar
 
+import torch
 from torch import Tensor, nn
 
 
@@ -21,6 +22,11 @@ class Splats(nn.Module):
 
     def __len__(self) -> int:
         return self.get_parameter(self.NAMES[0]).shape[0]
+
+    @property
+    def device(self) -> torch.device:
+        """Where the parameters are."""
+        return self.get_parameter(self.NAMES[0]).device
 
     @classmethod
     def check(cls, tensors: Mapping[str, Tensor]) -> None:

@@ -6,18 +6,27 @@ import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from tsplat.camera import Camera
 from tsplat.checks import check_tensor
 from tsplat.scene.module import Splats
 from tsplat.scene.neighbours import nearest_squared_distances
 from tsplat.scene.ply_table import binary_rows, columns, read_header, write_columns
+from tsplat.spheres import SphereRendering, render_spheres
 
 MIN_RADIUS = 1e-7
 COLUMNS = ("x", "y", "z", "radius", "opacity")
 COMMENT = "tsplat spheres"
+
+
+def is_spheres(path: str | os.PathLike[str]) -> bool:
+    """Whether a file is a .ply of spheres."""
+    path = Path(path)
+    return path.suffix.lower() == ".ply" and any(c.startswith(COMMENT) for c in read_header(path).comments)
 
 
 class Spheres(Splats):
@@ -57,6 +66,25 @@ class Spheres(Splats):
     def opacities(self) -> Tensor:
         """`[N]` in 0..1."""
         return self.opacity_logits.sigmoid()
+
+    def render(self, camera: Camera, *, gamma: float | Tensor | None = None, **options: Any) -> SphereRendering:
+        """`tsplat.render_spheres` of these spheres, with their own gamma, near and far.
+
+        Args:
+            camera: one or a batch.
+            gamma: instead of their own.
+            options: further arguments of `tsplat.render_spheres`.
+        """
+        return render_spheres(self.positions, self.features, self.radii, camera, opacities=self.opacities,
+                              gamma=self.gamma if gamma is None else gamma, near=self.near, far=self.far, **options)
+
+    def get_extra_state(self) -> dict[str, float]:
+        """Part of `state_dict`."""
+        return {"gamma": self.gamma, "near": self.near, "far": self.far}
+
+    def set_extra_state(self, state: Mapping[str, float]) -> None:
+        """Take on what `get_extra_state` gave."""
+        self.gamma, self.near, self.far = state["gamma"], state["near"], state["far"]
 
     def extra_repr(self) -> str:
         """What `repr` shows."""

@@ -16,8 +16,7 @@ with these differences:
 | `DefaultStrategy` | never resets opacities (a slip of `&` in 1.5.3) | resets every `reset_every` steps, as documented |
 | wrong arguments | assertions | `ValueError`, `TypeError` that say what is expected |
 
-3DGUT (`with_ut`, `with_eval3d`, distortion, rolling shutter), f-theta cameras, `distributed`, 2DGS and compressed .ply raise
-`NotImplementedError`.
+3DGUT (`with_ut`, `with_eval3d`, distortion, rolling shutter), f-theta and lidar cameras, `distributed` and 2DGS raise `NotImplementedError`.
 """
 
 from tsplat.compat.gsplat.exporter import export_splats as export_splats

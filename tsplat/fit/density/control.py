@@ -10,7 +10,6 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from tsplat.camera import Camera
-from tsplat.rasterize import Meta
 
 
 @dataclass(frozen=True)
@@ -42,7 +41,7 @@ class Control(Protocol):
         """Arguments for `rasterize` in step `step` (counted from 1) that collect what `observe` needs to know."""
         ...
 
-    def observe(self, meta: Meta, camera: Camera) -> None:
+    def observe(self, meta: Any, camera: Camera) -> None:
         """Take note of one backward pass."""
         ...
 
@@ -74,7 +73,7 @@ class NoControl:
         """None."""
         return {}
 
-    def observe(self, meta: Meta, camera: Camera) -> None:
+    def observe(self, meta: Any, camera: Camera) -> None:
         """Nothing."""
 
     def update(self, scene: nn.Module, optimiser: Optimizer, step: int, generator: torch.Generator) -> None:

@@ -194,7 +194,7 @@ def _read_primitive(document: Json, binary: Reader, primitive: Json, budget: int
     if primitive.get("mode", int, 4) != POINTS:
         raise primitive.wrong(f"expected mode {POINTS}, points; got {primitive.value.get('mode', 4)}")
     if extension.get("colorSpace", str, "").startswith("lin_"):
-        warnings.warn(f"{binary.path}: {primitive.name} has colours in linear space, which are rendered as they are")
+        warnings.warn(f"{binary.path}: colours in linear space are rendered as they are")
     attributes = primitive.at("attributes")
     names = attributes.value if isinstance(attributes.value, dict) else {}
     degree = next((degree for degree in range(MAX_DEGREE, 0, -1) if f"{EXTENSION}:{_harmonic(degree ** 2)}" in names), 0)

@@ -87,6 +87,7 @@ def samples() -> list[Sample]:
     files = sog(n=6)
     found += [Sample("l.sog", tuple(files.values()), lambda parts: zipped(dict(zip(files, parts, strict=True)))),
               Sample("m.sog", (zipped(files, zipfile.ZIP_DEFLATED),), b"".join)]
+    found += [Sample(f"{name}.ksplat", ksplat(level), b"".join) for level, name in enumerate("nop")]
     return found
 
 
@@ -127,6 +128,21 @@ def _chunks(parts: Parts) -> bytes:
     text = parts[0] + b" " * (-len(parts[0]) % 4)
     return (struct.pack("<4sII", b"glTF", 2, 28 + len(text) + len(parts[1])) + struct.pack("<I4s", len(text), b"JSON") + text
             + struct.pack("<I4s", len(parts[1]), b"BIN\0") + parts[1])
+
+
+def ksplat(level: int, degree: int = 1, seed: int = 0) -> Parts:
+    """The header, that of the one section, its buckets (one of 4 splats, one of 2) and its rows."""
+    rng = np.random.default_rng(seed)
+    n, rest = 6, 3 * ((degree + 1) ** 2 - 1)
+    header = struct.pack("<BB2xIIIIH14xff4052x", 0, 1, 1, 1, n, n, level, -1.0, 2.0)
+    section = struct.pack("<IIIIfH2xIIIIH982x", n, n, 4, 2, 5.0, 12, 32767, 0, 1, 1, degree)
+    buckets = struct.pack("<I6f", 2, *rng.normal(size=6))
+    floats = "<f2" if level else "<f4"
+    means = rng.integers(0, 65535, (n, 3)).astype("<u2") if level else rng.normal(size=(n, 3)).astype("<f4")
+    coefficients = rng.integers(0, 255, (n, rest)).astype("u1") if level == 2 else rng.normal(size=(n, rest)).astype(floats)
+    columns = (means, rng.random((n, 3)).astype(floats), rng.normal(size=(n, 4)).astype(floats), rng.integers(0, 255, (n, 4)).astype("u1"),
+               coefficients)
+    return header, section, buckets, b"".join(column[i].tobytes() for i in range(n) for column in columns)
 
 
 def zipped(files: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:

@@ -115,7 +115,7 @@ def _add_eval(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_eval)
     parser.description = ("Measure a scene against the held-out photos of a capture. What is not given here is taken from the config.json "
                           "beside the scene, if there is one: then the result is what metrics.json says.")
-    parser.add_argument("scene", type=Path, metavar="SCENE", help="a scene file (.ply)")
+    parser.add_argument("scene", type=Path, metavar="SCENE", help=SCENE)
     parser.add_argument("data", metavar="DATA", help="the capture: folder or transforms.json")
     parser.add_argument("-o", "--out", type=Path, metavar="OUT.json", help="also write the metrics of each photo to this file")
     _add_device(parser)

@@ -16,8 +16,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from bench.fuzz_readers import Sample, check, mutated, samples, scene, sog, webp, zipped
+from bench.fuzz_readers import Sample, check, ksplat, mutated, samples, scene, sog, webp, zipped
 from tsplat.scene import Gaussians
+from tsplat.scene.formats import is_sog
+from tsplat.scene.gaussians import SH_C0
 from tsplat.scene.ply_table import read_header
 
 SAMPLES = samples()
@@ -85,13 +87,13 @@ def test_foreign_files(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", ["a.spz", "a.splat", "a.glb", "a.compressed.ply"])
 def test_full_disk_leaves_the_old_file(tmp_path: Path, name: str) -> None:
     resource = pytest.importorskip("resource", reason="needs POSIX file size limits")
-    scene(3).save(tmp_path / name)
+    scene(3, degree=0).save(tmp_path / name)
     before = (tmp_path / name).read_bytes()
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (2048, limits[1]))
     try:
         with pytest.raises(OSError, match=r"large|space"):
-            scene(2000).save(tmp_path / name)
+            scene(2000, degree=0).save(tmp_path / name)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert (tmp_path / name).read_bytes() == before
@@ -302,12 +304,52 @@ def test_sog_bombs(tmp_path: Path) -> None:
     assert peak(lambda: refused(path, bomb, reason)) < 3 * 64 * len(bomb)
 
 
+@pytest.mark.parametrize("level", range(3))
+def test_ksplat(tmp_path: Path, level: int) -> None:
+    """Row by row as the format is described; then what is refused."""
+    path = tmp_path / "a.ksplat"
+    header, section, buckets, rows = ksplat(level)
+    assert check(path, header + section + buckets + rows)
+    loaded = Gaussians.load(path)
+    size = len(rows) // 6
+    kind = "<3f3f4f4B9f" if level == 0 else "<3H3e4e4B9e" if level == 1 else "<3H3e4e4B9B"
+    assert struct.calcsize(kind) == size
+    centres = np.frombuffer(buckets[4:], "<f4").reshape(2, 3)
+    for i in range(6):
+        values = np.array(struct.unpack_from(kind, rows, i * size), np.float64)
+        mean = values[:3] if level == 0 else (values[:3] - 32767) / 32767 * 2.5 + centres[0 if i < 4 else 1]
+        rest = values[14:] if level < 2 else values[14:] / 255 * 3 - 1
+        for found, expected in ((loaded.means, mean), (loaded.scales, values[3:6]), (loaded.quats, values[6:10]), (loaded.sh_rest.mT, rest)):
+            np.testing.assert_allclose(found[i].detach().flatten().numpy(), expected, rtol=2e-6, atol=1e-6)
+        np.testing.assert_allclose((SH_C0 * loaded.sh0[i, 0] + 0.5).detach().numpy(), values[10:13] / 255, atol=1e-6)
+        assert loaded.opacities[i].item() == pytest.approx(values[13] / 255, abs=1e-6)
+
+    def changed(data: bytes, at: int, kind: str, value: float) -> bytes:
+        return data[:at] + struct.pack(kind, value) + data[at + struct.calcsize(kind):]
+
+    for a, b, match in ((changed(header, 1, "B", 2), section, "at byte 0: expected .ksplat version 0.1; got 0.2"),
+                        (changed(header, 20, "<H", 3), section, "at byte 20: expected compression level 0 to 2; got 3"),
+                        (changed(header, 16, "<I", 7), section, "at byte 16: expected 7 splats, as the header says; found 6 in 1 sections"),
+                        (changed(header, 4, "<I", (1 << 32) - 1), section, "truncated: expected 1024 bytes of the header of a section"),
+                        (header, changed(section, 40, "<H", 3), "at byte 4136: expected spherical harmonics of degree 0 to 2; got 3"),
+                        (header, changed(section, 0, "<I", 7), "at byte 4096: expected at most 6 splats"),
+                        (header, changed(section, 4, "<I", 1 << 31), "truncated: expected .* bytes of splats"),
+                        (header, changed(section, 12, "<I", 1 << 31), r"1 \+ 1 buckets of 12 bytes; got 6 and 2147483648"),
+                        (header, changed(changed(section, 12, "<I", 1 << 31), 32, "<I", (1 << 31) - 1), "bytes of centres of buckets; found")):
+        assert peak(lambda data=a + b, match=match: refused(path, data + buckets + rows, match)) < MEMORY
+    if level:
+        refused(path, header + section + changed(buckets, 0, "<I", 1) + rows, "at byte 4096: expected buckets for 6 splats; got them for 5")
+
+
 def test_sog_folder(tmp_path: Path) -> None:
     files = sog(6, degree=2)
     for name, data in files.items():
         (tmp_path / name).write_bytes(data)
     loaded = Gaussians.load(tmp_path)
     assert (len(loaded), loaded.sh_degree) == (6, 2)
+    (tmp_path / "capture").mkdir()
+    (tmp_path / "capture" / "meta.json").write_text("{}")
+    assert [is_sog(tmp_path), is_sog(tmp_path / "capture")] == [True, False]
     (tmp_path / "quats.webp").unlink()
     with pytest.raises(FileNotFoundError, match=r"quats\.webp"):
         Gaussians.load(tmp_path / "meta.json")

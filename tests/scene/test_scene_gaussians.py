@@ -130,7 +130,7 @@ def test_inconsistent_state_changes_nothing() -> None:
     assert len(gaussians) == 4
 
 
-@pytest.mark.parametrize("name", ["scene.ksplat", "scene", "scene.ply.gz"])
+@pytest.mark.parametrize("name", ["scene.obj", "scene", "scene.ply.gz"])
 def test_unknown_suffix(tmp_path: Path, name: str) -> None:
     with pytest.raises(ValueError, match=r"ends in \.ply"):
         Gaussians.load(tmp_path / name)

@@ -122,7 +122,7 @@ class Gaussians(Splats):
     @classmethod
     def load(cls, path: str | os.PathLike[str]) -> Gaussians:
         """Read a file in the format of its name: `.ply` (3DGS, or PlayCanvas's compressed kind), `.splat`, `.spz`, `.glb`
-        (KHR_gaussian_splatting), `.sog` (or the meta.json or folder of an unpacked one). All have the axes of a .ply then.
+        (KHR_gaussian_splatting), `.sog` (or the meta.json or folder of an unpacked one), `.ksplat`. All have the axes of a .ply then.
 
         Raises:
             ValueError: an unknown name, or a file that is not what its name says: one line with the file and what is wrong where.

@@ -9,6 +9,7 @@ from pathlib import Path
 
 from tsplat.scene.formats.compressed_ply import is_compressed_ply, read_compressed_ply, write_compressed_ply
 from tsplat.scene.formats.gltf import read_glb, write_glb
+from tsplat.scene.formats.ksplat import read_ksplat
 from tsplat.scene.formats.sog import META, is_sog, read_sog
 from tsplat.scene.formats.splat import read_splat, write_splat
 from tsplat.scene.formats.spz import read_spz, write_spz
@@ -32,7 +33,7 @@ PLY = Format("3DGS .ply", ".ply", read_ply, write_ply)
 COMPRESSED_PLY = Format("PlayCanvas compressed .ply", ".compressed.ply", read_compressed_ply, write_compressed_ply)
 SOG = Format("SOG", ".sog", read_sog, None)
 FORMATS = (PLY, COMPRESSED_PLY, Format(".splat", ".splat", read_splat, write_splat), Format("SPZ", ".spz", read_spz, write_spz),
-           Format("glTF, KHR_gaussian_splatting", ".glb", read_glb, write_glb), SOG)
+           Format("glTF, KHR_gaussian_splatting", ".glb", read_glb, write_glb), SOG, Format(".ksplat", ".ksplat", read_ksplat, None))
 
 
 def find_format(path: str | os.PathLike[str], *, writing: bool = False) -> Format:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 import os
 import warnings
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -60,6 +61,13 @@ class Fields:
             quats = (quats / lengths).astype(np.float32)
         return cls(means[keep], quats[keep], log_scales[keep], logits[keep].clip(-MAX_LOGIT, MAX_LOGIT), sh0[keep, 0],
                    sh_rest[keep, :(max_degree + 1) ** 2 - 1])
+
+    @classmethod
+    def joined(cls, parts: Sequence[Fields]) -> Fields:
+        """One after the other, with the highest degree of theirs."""
+        most = max(part.sh_rest.shape[1] for part in parts)
+        padded = [replace(part, sh_rest=np.pad(part.sh_rest, ((0, 0), (0, most - part.sh_rest.shape[1]), (0, 0)))) for part in parts]
+        return cls(*(np.concatenate([getattr(part, item.name) for part in padded]) for item in fields(cls)))
 
     def gaussians(self) -> Gaussians:
         """As a module."""

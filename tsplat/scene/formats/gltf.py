@@ -11,6 +11,7 @@ import math
 import os
 import struct
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -75,10 +76,8 @@ def read_glb(path: str | os.PathLike[str]) -> Gaussians:
     if not parts:
         raise malformed(path, document.offset, f"expected a primitive with the extension {EXTENSION} in the scene; found none")
     logarithms = any(bool((fields.log_scales < 0).any()) for _, fields, _ in parts)
-    degree = max(fields.degree for _, fields, _ in parts)
-    placed = [_placed(node, fields, matrix, logarithms, degree) for node, fields, matrix in parts]
-    joined = Fields(*(np.concatenate([getattr(fields, name) for fields in placed]) for name in Fields.__dataclass_fields__))
-    return joined.turned(UP_AND_FRONT).gaussians()
+    placed = [_placed(node, fields, matrix, logarithms) for node, fields, matrix in parts]
+    return Fields.joined(placed).turned(UP_AND_FRONT).gaussians()
 
 
 def write_glb(path: str | os.PathLike[str], gaussians: Gaussians) -> None:
@@ -247,19 +246,16 @@ def _read_accessor(document: Json, binary: Reader, accessor: Json, kind: str) ->
     return values
 
 
-def _placed(node: Json, fields: Fields, matrix: NDArray[np.float64], logarithms: bool, degree: int) -> Fields:
-    """The splats in the world, with coefficients up to `degree`."""
+def _placed(node: Json, fields: Fields, matrix: NDArray[np.float64], logarithms: bool) -> Fields:
+    """The splats in the world."""
     linear = matrix[:3, :3]
     with np.errstate(over="ignore"):
         scale = float(np.cbrt(np.linalg.det(linear))) if np.isfinite(matrix).all() else 0.0
     if not 0 < scale < math.inf or not np.allclose(linear @ linear.T, scale ** 2 * np.eye(3), rtol=0, atol=TOLERANCE * scale ** 2):
         raise node.wrong("expected a matrix that moves, turns and scales all axes alike, as splats cannot be sheared or mirrored")
     log_scales = (fields.log_scales if logarithms else log_scales_of(fields.log_scales)) + np.float32(math.log(scale))
-    missing = (degree + 1) ** 2 - (fields.degree + 1) ** 2
-    sh_rest = np.pad(fields.sh_rest, ((0, 0), (0, missing), (0, 0)))
-    fields = Fields(fields.means, fields.quats, log_scales, fields.logits, fields.sh0, sh_rest)
     if not np.array_equal(linear, scale * np.eye(3)):
         fields = fields.turned(linear / scale)
     with np.errstate(over="ignore", invalid="ignore"):
         means = fields.means * np.float32(scale) + matrix[:3, 3].astype(np.float32)
-    return Fields(means, fields.quats, fields.log_scales, fields.logits, fields.sh0, fields.sh_rest)
+    return replace(fields, means=means, log_scales=log_scales)

@@ -31,8 +31,8 @@ ROOM = 1 << 14                      # ... and what is let through in any case
 
 
 def is_sog(path: Path) -> bool:
-    """Whether the name says so: `*.sog`, a `meta.json`, or a folder with one."""
-    return path.suffix.lower() == ".sog" or path.name == META or (path / META).is_file()
+    """Whether the name says so: `*.sog`, a `meta.json`, or a folder with one and WebP images."""
+    return path.suffix.lower() == ".sog" or path.name == META or ((path / META).is_file() and any(path.glob("*.webp")))
 
 
 def read_sog(path: str | os.PathLike[str]) -> Gaussians:

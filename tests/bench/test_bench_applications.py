@@ -70,7 +70,7 @@ def test_head_and_its_neural_shading(application: ModuleType, shared: Path, tmp_
     assert len(result.spheres) == counts[4]
     assert image_size(tmp_path / "picture.png") == (4 * 32, 32)
     shading = importlib.import_module("neural_shading")
-    before, longer, after = shading.main(options(shared, tmp_path, f"--steps 5 --downscale 8 --spheres {spheres}"))
+    before, longer, after = shading.main(options(shared, tmp_path, f"--steps 20 --downscale 8 --spheres {spheres}"))
     assert longer > before
     assert after > before
     assert image_size(tmp_path / "picture.png") == (4 * 32, 3 * 32)

@@ -6,6 +6,8 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+os.environ.setdefault("OMP_NUM_THREADS", "1")           # arrays are small, and several processes of pytest-xdist share the cores
+
 import torch
 
 if not torch.cuda.is_available():
@@ -46,15 +48,6 @@ def shared() -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _same_start(request: pytest.FixtureRequest) -> Iterator[None]:
-    """The same seed for every test, whatever ran before, and one thread for those of this folder.
-
-    Their arrays are small, and a second thread would wait in loops; `test_parallel.py` and tests of chunks take more
-    explicitly.
-    """
+def _same_start() -> None:
+    """The same seed for every test, whatever ran before. (`test_parallel.py` and tests of chunks take more threads than one explicitly.)"""
     torch.manual_seed(0)
-    threads = torch.get_num_threads()
-    if request.path.parent == HERE:
-        torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(threads)

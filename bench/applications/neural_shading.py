@@ -44,7 +44,7 @@ class Decoder(nn.Module):
 
 def main(argv: list[str] | None = None) -> tuple[float, float, float]:
     """Optimise the colours, then features and network, print and draw."""
-    parser = arguments(__doc__, "neural_shading.png", steps=300, batch=1, downscale=2.0)
+    parser = arguments(__doc__, "neural_shading.png", steps=150, batch=1, downscale=2.0)
     parser.add_argument("--spheres", type=Path, default=ROOT / "out" / "head.pt", help="what head.py wrote (default: out/head.pt)")
     args = parser.parse_args(argv)
     if not args.spheres.is_file():
@@ -60,7 +60,7 @@ def main(argv: list[str] | None = None) -> tuple[float, float, float]:
         stage = head.stage_of_head(channels)
         extra = 0.1 * torch.randn(len(spheres), channels - 3, generator=generator)
         featured = spheres.with_features(torch.cat([spheres.features.detach(), extra], 1))
-        groups = [{"params": [featured.features], "lr": 2e-2}, {"params": list(decoder.parameters()), "lr": 5e-3}]
+        groups = [{"params": [featured.features], "lr": 2e-2}, {"params": list(decoder.parameters()), "lr": 3e-3}]
 
         def loss(some: Views, gamma: float) -> Tensor:
             return (decoder(stage.render(featured, some.cameras, gamma)) - some.images).abs().mean()

@@ -25,7 +25,7 @@ def measure(name: str, description: str | None, config: FitConfig, parts: tuple[
 
     Args:
         name, description: of the script.
-        config: with which; `--steps`, `--max-splats`, `--density` and `--seeds` change it.
+        config: with which; `--steps`, `--splats`, `--max-splats`, `--density` and `--seeds` change it.
         parts: of the steps, after which the held-out photos are scored, too: a curve. That time does not count.
     """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -33,12 +33,14 @@ def measure(name: str, description: str | None, config: FitConfig, parts: tuple[
     parser.add_argument("--data", type=Path, default=data, help=f"the capture (default: data/{name} under TSPLAT_DATA)")
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--steps", type=int, default=config.steps)
+    parser.add_argument("--splats", type=int, default=config.splats)
     parser.add_argument("--max-splats", type=int, default=config.max_splats)
     parser.add_argument("--density", default=config.density)
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     for seed in options.seeds:
-        chosen = dataclasses.replace(config, steps=options.steps, max_splats=options.max_splats, density=options.density, seed=seed)
+        chosen = dataclasses.replace(config, steps=options.steps, splats=options.splats, max_splats=options.max_splats, density=options.density,
+                                     seed=seed)
         wall, cpu = time.perf_counter(), time.process_time()
         capture = load_capture(options.data, downscale=chosen.downscale, test_every=chosen.test_every)
         curve = _Curve(capture, chosen, parts)

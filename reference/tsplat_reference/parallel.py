@@ -41,17 +41,17 @@ def workers(worth: bool = True) -> Iterator[OrderedMap]:
     """Gives a map over independent pieces, without autograd, on `torch.get_num_threads()` threads.
 
     Meanwhile the calling thread's own operations are single-threaded, too: after a parallel one, OpenMP's threads would spin for a
-    while and take the cores away from the workers. With `worth` False there are no workers, and all is done by the calling thread: where
-    there is little to do, handing it over costs more than it gains.
+    while and take the cores away from the workers. With `worth` False there are no workers: where there is little to do, handing it over
+    costs more than it gains. Then the calling thread does all, and its operations are as parallel as torch makes them.
     """
     threads = torch.get_num_threads()
-    if threads == 1:
+    if threads == 1 or not worth:
         yield _plain_map
         return
-    pool = _pool(threads) if worth else None
+    pool = _pool(threads)
     torch.set_num_threads(1)
     try:
-        yield _plain_map if pool is None else functools.partial(_pool_map, pool, threads)
+        yield functools.partial(_pool_map, pool, threads)
     finally:
         torch.set_num_threads(threads)
 

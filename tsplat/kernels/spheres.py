@@ -250,10 +250,9 @@ def upstream_kernel(image, depths, logsumexp, backgrounds, gamma, v_image, v_dep
     level = tl.full((), background_depth, dt) * inv_gamma
     lse = tl.load(logsumexp + at, mask=inside, other=float("inf"))
     weight = tl.exp(level - lse)                                        # of the background
-    same = lse * 0.0 if v_logsumexp is None else tl.load(v_logsumexp + at, mask=inside, other=0.0)
+    same = weight * 0.0 if v_logsumexp is None else tl.load(v_logsumexp + at, mask=inside, other=0.0)
     if v_depth is not None:
         same -= tl.load(depths + at, mask=inside, other=0.0) * tl.load(v_depth + at, mask=inside, other=0.0)
-    same = tl.where(inside, same, 0.0)
     behind = same * 0.0
     out = partials + (view * tl.num_programs(0) + tl.program_id(0)) * (D + 1)
     begin = 0

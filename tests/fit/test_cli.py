@@ -150,7 +150,7 @@ def test_info_capture(capture_folder: Path, capsys: pytest.CaptureFixture[str]) 
     (["fit", "{capture}", "-o", "{scene}"], "cloud.ply: expected a folder to write to"),
     (["fit", "{capture}", "-o", "{tmp}/out", "--steps", "-5"], "steps: expected"),
     (["fit", "{capture}", "-o", "{tmp}/out", "--device", "toaster"], "--device: expected"),
-    (["fit", "{capture}", "-o", "{tmp}/out", "--primitive", "spheres"], "primitive: 'spheres' cannot be fitted yet"),
+    (["fit", "{capture}", "-o", "{tmp}/out", "--primitive", "spheres", "--density", "mcmc"], "density: expected 'budget'"),
     (["fit", "{capture}", "-o", "{tmp}/out", "--config", "{scene}"], "cloud.ply: expected a config.json"),
     (["eval", "{scene}", "{capture}", "--test-every", "0"], "expected held-out photos; there are none with test_every = 0"),
     (["render", "{tmp}/none.ply", "-o", "{tmp}/a.png"], "none.ply: No such file"),

@@ -129,7 +129,7 @@ LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "blend_spheres": {family: {"num_warps": 1} for family in FAMILIES},
     "blend_spheres_backward": {family: {"num_warps": 1} for family in FAMILIES},
     "nearest_hits": {family: {"num_warps": 1} for family in FAMILIES},
-    "sphere_features": {"nvidia": {"K": 16, "DB": 64, "num_warps": 8}, "cdna": {"K": 16, "DB": 32, "num_warps": 8},
+    "sphere_features": {"nvidia": {"K": 16, "DB": 32, "num_warps": 8}, "cdna": {"K": 16, "DB": 32, "num_warps": 8},
                         "rdna": {"K": 16, "DB": 32, "num_warps": 8}},
     "sphere_features_backward": {"nvidia": {"K": 16, "DB": 32, "num_warps": 4}, "cdna": {"K": 16, "DB": 32, "num_warps": 4},
                                  "rdna": {"K": 16, "DB": 16, "num_warps": 8}},

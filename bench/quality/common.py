@@ -25,7 +25,7 @@ def measure(name: str, description: str | None, config: FitConfig, parts: tuple[
 
     Args:
         name, description: of the script.
-        config: with which; `--steps`, `--splats`, `--max-splats`, `--density` and `--seeds` change it.
+        config: with which; `--steps`, `--splats`, `--max-splats`, `--density`, `--resolution-warmup` and `--seeds` change it.
         parts: of the steps, after which the held-out photos are scored, too: a curve. That time does not count.
     """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -36,11 +36,12 @@ def measure(name: str, description: str | None, config: FitConfig, parts: tuple[
     parser.add_argument("--splats", type=int, default=config.splats)
     parser.add_argument("--max-splats", type=int, default=config.max_splats)
     parser.add_argument("--density", default=config.density)
+    parser.add_argument("--resolution-warmup", type=float, default=config.resolution_warmup)
     parser.add_argument("--device", default="cpu")
     options = parser.parse_args()
     for seed in options.seeds:
         chosen = dataclasses.replace(config, steps=options.steps, splats=options.splats, max_splats=options.max_splats, density=options.density,
-                                     seed=seed)
+                                     resolution_warmup=options.resolution_warmup, seed=seed)
         wall, cpu = time.perf_counter(), time.process_time()
         capture = load_capture(options.data, downscale=chosen.downscale, test_every=chosen.test_every)
         curve = _Curve(capture, chosen, parts)

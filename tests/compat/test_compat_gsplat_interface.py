@@ -205,6 +205,41 @@ def test_on_the_kernels(backend: Backend) -> None:
         assert_close(staged, image[..., :3], 1e-12)
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_the_image_may_be_written_into(mode: str) -> None:
+    """As training loops do with masks; the gradient is that of the pixels that are left."""
+    found = []
+    for in_place in (True, False):
+        args = scene()
+        image, _, _ = rasterization(**args, render_mode=mode)
+        mask = torch.arange(image.shape[2]) % 3 > 0
+        if in_place:
+            image[..., ~mask, :] = 0
+        loss_of(image if in_place else image * mask[:, None]).backward()
+        found.append([args[k].grad for k in ("means", "quats", "opacities", "viewmats")])
+    assert_close(*found, 1e-14)
+
+
+def test_the_image_of_the_stage_may_be_written_into() -> None:
+    args = scene()
+    image, _, meta = rasterization(**args)
+    colors = args["colors"][meta["gaussian_ids"]]
+    staged, _ = rasterize_to_pixels(meta["means2d"], meta["conics"], colors, meta["opacities"], 24, 17, 16, meta["isect_offsets"],
+                                    meta["flatten_ids"], packed=True)
+    staged.mul_(2)
+    found = [torch.autograd.grad(loss_of(x), args["means"], retain_graph=True)[0] for x in (staged, 2 * image)]
+    assert_close(*found, 1e-12)
+
+
+def test_sizes_of_numpy() -> None:
+    """As gsplat's parser gives them for cropped fisheye images."""
+    args = scene()
+    want, _, _ = rasterization(**args)
+    image, _, meta = rasterization(**(args | {"width": numpy.int64(args["width"]), "height": numpy.int32(args["height"])}))
+    assert torch.equal(image, want)
+    assert meta["isect_offsets"].shape == (2, meta["tile_height"], meta["tile_width"])
+
+
 def test_radius_clip_leaves_out_the_small() -> None:
     args = scene()
     _, _, meta = rasterization(**args, packed=False)

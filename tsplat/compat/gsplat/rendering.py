@@ -9,6 +9,7 @@ from collections import UserDict
 from collections.abc import Callable
 from typing import Any
 
+import numpy
 import torch
 from torch import Tensor
 from tsplat_reference import camera_centers
@@ -99,6 +100,8 @@ def rasterization(means: Tensor, quats: Tensor | None, scales: Tensor | None, op
     check_choice("render_mode", render_mode, RENDER_MODES)
     check_choice("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
     check_size("tile_size", tile_size)
+    # numpy's, as gsplat's own parser of fisheye captures has them
+    width, height = (int(v) if isinstance(v, numpy.integer) else v for v in (width, height))
     if covars is not None:
         check_tensor("covars", covars, (..., 3, 3))
         covars = covars.flatten(-2)[..., TRIANGLE]

@@ -149,7 +149,10 @@ def rasterize_to_pixels(means2d: Tensor, conics: Tensor, colors: Tensor, opaciti
 
 def draw(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, ids: Tensor, offsets: Tensor,
          images: int, width: int, height: int, tile: int, layout: Packed | None, absgrad: bool) -> tuple[Tensor, Tensor]:
-    """Blend by lists of the core: images `[I, H, W, D]` and alphas `[I, H, W, 1]`. With `absgrad`, backward sets `means2d.absgrad`."""
+    """Blend by lists of the core: images `[I, H, W, D]` and alphas `[I, H, W, 1]`. With `absgrad`, backward sets `means2d.absgrad`.
+
+    The image is a copy of what backward reads, as training loops write into it (`colors[~masks] = 0`).
+    """
     m, c, o, f = per_image(images, layout, means2d, conics, opacities, colors)
     probe = None
     if absgrad:
@@ -157,7 +160,7 @@ def draw(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, bac
         probe.register_hook(  # type: ignore[no-untyped-call]
             lambda v: setattr(means2d, "absgrad", v.view_as(means2d) if layout is None else layout.gather(v)))
     color, alpha = ops.blend(m, c, o, f, backgrounds, probe, ids, offsets, width, height, tile, ALPHA_MAX, True)
-    return color, alpha[..., None]
+    return color.clone() if color.requires_grad else color, alpha[..., None]
 
 
 def per_image(images: int, layout: Packed | None, means2d: Tensor, *values: Tensor) -> list[Tensor]:

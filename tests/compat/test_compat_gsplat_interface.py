@@ -231,6 +231,14 @@ def test_the_image_of_the_stage_may_be_written_into() -> None:
     assert_close(*found, 1e-12)
 
 
+@pytest.mark.parametrize("mode", ["D", "ED"])
+def test_the_background_of_depth_is_zero(mode: str) -> None:
+    """Whatever is given, of as many channels as it may have."""
+    args = scene()
+    want, _, _ = rasterization(**args, render_mode=mode)
+    assert torch.equal(rasterization(**args, render_mode=mode, backgrounds=torch.ones(2, 1, dtype=torch.float64))[0], want)
+
+
 def test_sizes_of_numpy() -> None:
     """As gsplat's parser gives them for cropped fisheye images."""
     args = scene()

@@ -254,6 +254,18 @@ def test_the_gradient_that_grows_is_that_of_half_an_image() -> None:
         assert_close(state["radii"], radii.amax(0) / WIDTH, 1e-6)
 
 
+@pytest.mark.parametrize("packed", [True, False])
+def test_packed_is_that_of_the_rendering(packed: bool) -> None:
+    """Or gradients would be taken for those of other Gaussians."""
+    _, cam = target_and_camera()
+    params, strategy = parameters(), DefaultStrategy()
+    image, _, info = render(params, cam, packed=not packed)
+    strategy.step_pre_backward(params, {}, {}, 0, info)
+    image.sum().backward()
+    with pytest.raises(ValueError, match=f"packed: expected {not packed}"):
+        strategy.step_post_backward(params, {}, strategy.initialize_state(), 0, info, packed=packed)
+
+
 def test_what_grows_and_what_goes() -> None:
     """Small and large with a high gradient, a transparent one, and a huge one, each of which has its fate."""
     params = parameters(5)

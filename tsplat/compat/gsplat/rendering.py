@@ -108,6 +108,7 @@ def rasterization(means: Tensor, quats: Tensor | None, scales: Tensor | None, op
     batch, N, C = check_scene(means, covars, quats, scales, viewmats, Ks)
     check_tensor("opacities", opacities, (*batch, N), like=means)
     _check_colors(colors, means, batch, N, C, sh_degree)
+    backgrounds = backgrounds if "RGB" in render_mode else None         # that of depth is 0, whatever the shape
     if backgrounds is not None:
         check_tensor("backgrounds", backgrounds, (*batch, C, colors.shape[-1]), like=means)
     if sparse_grad and (not packed or batch):
@@ -136,8 +137,7 @@ def rasterization(means: Tensor, quats: Tensor | None, scales: Tensor | None, op
     if render_mode != "RGB":
         channels.append(depths[..., None])
     if backgrounds is not None:
-        backgrounds = backgrounds.reshape(images, -1) if channels[0] is view_colors else backgrounds.new_zeros(images, 0)
-        backgrounds = torch.nn.functional.pad(backgrounds, (0, int(render_mode != "RGB")))
+        backgrounds = torch.nn.functional.pad(backgrounds.reshape(images, -1), (0, int(render_mode != "RGB")))
     color = torch.cat(channels, -1)
 
     ids, offsets = _bins(means2d, radii, conics, view_opacities, depths, color, images, width, height, layout)

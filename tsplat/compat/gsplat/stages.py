@@ -133,8 +133,13 @@ def rasterize_to_pixels(means2d: Tensor, conics: Tensor, colors: Tensor, opaciti
         check_tensor("backgrounds", backgrounds, (*images, colors.shape[-1]), like=means2d)
     if masks is not None and masks.shape != isect_offsets.shape:
         raise ValueError(f"masks: expected shape {list(isect_offsets.shape)}; got {list(masks.shape)}")
+    check_size("tile_size", tile_size)
+    tile_height, tile_width = isect_offsets.shape[-2:]
+    if tile_width * tile_size < image_width or tile_height * tile_size < image_height:
+        raise ValueError(f"isect_offsets: expected tiles of {tile_size} that cover {image_width} x {image_height} pixels; "
+                         f"got {tile_width} x {tile_height}")
     ids, offsets, tile = core_lists(isect_offsets, flatten_ids, masks, image_width, image_height, tile_size)
-    I, tiles = math.prod(images), isect_offsets.shape[-2] * isect_offsets.shape[-1]
+    I, tiles = math.prod(images), tile_height * tile_width
     layout = None
     if packed:                                          # the image of a splat is that of the tiles that list it
         tile_of = torch.searchsorted(isect_offsets.reshape(-1).long(), torch.arange(len(flatten_ids), device=ids.device), right=True) - 1

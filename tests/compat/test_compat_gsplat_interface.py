@@ -19,7 +19,7 @@ from torch import Tensor
 
 from tsplat import rasterize
 from tsplat.compat import gsplat
-from tsplat.compat.gsplat import fully_fused_projection, quat_scale_to_covar_preci, rasterization, rasterize_to_pixels
+from tsplat.compat.gsplat import fully_fused_projection, quat_scale_to_covar_preci, rasterization, rasterize_to_pixels, spherical_harmonics
 
 MODES = "RGB", "D", "ED", "RGB+D", "RGB+ED"
 
@@ -76,6 +76,29 @@ def test_render_modes_are_the_core_s(mode: str, antialiased: bool, packed: bool)
     assert_close(found, expected, 1e-12)
 
 
+@pytest.mark.parametrize("packed", [True, False])
+def test_harmonics_are_half_and_above_zero(packed: bool) -> None:
+    """Colours are max(SH + 0.5, 0), as Inria has them: the same as these as colours."""
+    args = scene()
+    bands = args["colors"].detach()[:, None] * 8 - 4
+    colors = (spherical_harmonics(0, torch.ones(12, 3, dtype=torch.float64), bands) + 0.5).clamp_min(0.0)
+    assert 0.2 < (colors == 0).double().mean() < 0.8
+    got, _, _ = rasterization(**(args | {"colors": bands}), sh_degree=0, packed=packed)
+    want, _, _ = rasterization(**(args | {"colors": colors}), packed=packed)
+    assert_close(got, want, 1e-14)
+
+
+def test_alpha_is_at_most_that_of_1_5_3() -> None:
+    """0.999, at the centre of a splat of opacity 1; with the gradient 0."""
+    opacity = torch.ones(1, requires_grad=True)
+    K = torch.tensor([[[10.0, 0.0, 8.5], [0.0, 10.0, 8.5], [0.0, 0.0, 1.0]]])
+    _, alpha, _ = rasterization(torch.tensor([[0.0, 0.0, 2.0]]), torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.ones(1, 3), opacity, torch.ones(1, 3),
+                                torch.eye(4)[None], K, 17, 17)
+    assert alpha.max().item() == alpha[0, 8, 8, 0].item() == pytest.approx(0.999, abs=1e-7)
+    alpha[0, 8, 8, 0].backward()
+    assert opacity.grad == 0
+
+
 @pytest.mark.parametrize(("name", "model"), [("ortho", "orthographic"), ("fisheye", "fisheye")])
 @pytest.mark.parametrize("packed", [True, False])
 def test_camera_models(name: str, model: str, packed: bool) -> None:
@@ -104,6 +127,7 @@ def test_batches_and_colours_of_each_camera(dims: tuple[int, ...], harmonics: bo
         assert image.shape == (*dims, 2, 17, 24, 4 if harmonics else 5)
         assert alpha.shape == (*dims, 2, 17, 24, 1)
         assert meta["isect_offsets"].shape == (*dims, 2, 2, 2)
+        assert (meta["n_batches"], meta["n_cameras"]) == (math.prod(dims), 2)
         for at in numpy.ndindex(*dims):
             one = {k: v[at] for k, v in args.items()}
             for c in range(2):
@@ -205,6 +229,49 @@ def test_on_the_kernels(backend: Backend) -> None:
         assert_close(staged, image[..., :3], 1e-12)
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_the_image_may_be_written_into(mode: str) -> None:
+    """As training loops do with masks; the gradient is that of the pixels that are left."""
+    found = []
+    for in_place in (True, False):
+        args = scene()
+        image, _, _ = rasterization(**args, render_mode=mode)
+        mask = torch.arange(image.shape[2]) % 3 > 0
+        if in_place:
+            image[..., ~mask, :] = 0
+        loss_of(image if in_place else image * mask[:, None]).backward()
+        found.append([args[k].grad for k in ("means", "quats", "opacities", "viewmats")])
+    assert_close(*found, 1e-14)
+
+
+def test_the_image_of_the_stage_may_be_written_into() -> None:
+    args = scene()
+    image, _, meta = rasterization(**args)
+    colors = args["colors"][meta["gaussian_ids"]]
+    staged, _ = rasterize_to_pixels(meta["means2d"], meta["conics"], colors, meta["opacities"], 24, 17, 16, meta["isect_offsets"],
+                                    meta["flatten_ids"], packed=True)
+    staged.mul_(2)
+    found = [torch.autograd.grad(loss_of(x), args["means"], retain_graph=True)[0] for x in (staged, 2 * image)]
+    assert_close(*found, 1e-12)
+
+
+@pytest.mark.parametrize("mode", ["D", "ED"])
+def test_the_background_of_depth_is_zero(mode: str) -> None:
+    """Whatever is given, of as many channels as it may have."""
+    args = scene()
+    want, _, _ = rasterization(**args, render_mode=mode)
+    assert torch.equal(rasterization(**args, render_mode=mode, backgrounds=torch.ones(2, 1, dtype=torch.float64))[0], want)
+
+
+def test_sizes_of_numpy() -> None:
+    """As gsplat's parser gives them for cropped fisheye images."""
+    args = scene()
+    want, _, _ = rasterization(**args)
+    image, _, meta = rasterization(**(args | {"width": numpy.int64(args["width"]), "height": numpy.int32(args["height"])}))
+    assert torch.equal(image, want)
+    assert meta["isect_offsets"].shape == (2, meta["tile_height"], meta["tile_width"])
+
+
 def test_radius_clip_leaves_out_the_small() -> None:
     args = scene()
     _, _, meta = rasterization(**args, packed=False)
@@ -273,6 +340,16 @@ def test_more_that_is_not_there() -> None:
 def test_arguments_that_are_wrong(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         rasterization(**(scene() | change))
+
+
+@pytest.mark.parametrize("size", [(33, 17), (24, 33)])
+def test_tiles_that_do_not_cover_the_image(size: tuple[int, int]) -> None:
+    """For which those of the next row or image would be taken."""
+    args = scene()
+    _, _, meta = rasterization(**args, packed=False)
+    with pytest.raises(ValueError, match="isect_offsets: expected tiles"):
+        rasterize_to_pixels(meta["means2d"], meta["conics"], args["colors"].expand(2, -1, -1), meta["opacities"], *size, 16, meta["isect_offsets"],
+                            meta["flatten_ids"])
 
 
 def test_splats_that_are_not_finite_are_left_out() -> None:

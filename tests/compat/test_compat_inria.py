@@ -123,6 +123,20 @@ def test_on_the_kernels(backend: Backend) -> None:
     assert_close([got[0], got[2]], [want[0], want[2]], 1e-12)
 
 
+def test_alpha_is_at_most_099() -> None:
+    """Of a black splat of opacity 1 that covers the image, a hundredth of the background is left; the gradient where it is clamped is 0."""
+    s, v = settings(), scene()
+    splat = Scene(*(getattr(v, field.name).detach()[5:6] for field in dataclasses.fields(v)))
+    splat.means3D[:], splat.scales[:], splat.colors[:] = 0.0, 30.0, 0.0
+    splat.opacities.requires_grad_()
+    image, _, _ = GaussianRasterizer(s)(**splat.arguments(False, False))
+    want, _, _ = plainly(s, splat, False, False, cut=True)
+    assert_close(image, want, 1e-12)
+    assert_close(image, (0.01 * s.bg[:, None, None]).expand_as(image), 1e-12)
+    image.sum().backward()
+    assert splat.opacities.grad == 0
+
+
 def test_what_inria_cuts_off_at_its_tiles() -> None:
     """With the cut, the plain image differs by no more than the opacity beyond 3 standard deviations, exp(-4.5), of each splat there."""
     s, v = settings(scale_modifier=3.0), scene()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import inspect
 import itertools
 import json
 import math
@@ -236,6 +237,17 @@ def rotation(axis_angle: Tensor) -> Tensor:
     k = axis_angle / angle
     K = torch.tensor([[0, -k[2], k[1]], [k[2], 0, -k[0]], [-k[1], k[0], 0]], dtype=torch.float64)
     return torch.eye(3, dtype=torch.float64) + angle.sin() * K + (1 - angle.cos()) * K @ K
+
+
+def test_the_signatures_are_the_documented_ones() -> None:
+    """Names, order and defaults of PyTorch3D's, and one argument more."""
+    for function, text in ((Renderer, "width height max_num_balls orthogonal_projection=False right_handed_system=False "
+                                      "background_normalized_depth=1e-06 n_channels=3 n_track=5 tracked_only=False"),
+                           (Renderer.forward, "self vert_pos vert_col vert_rad cam_params gamma max_depth min_depth=0.0 bg_col=None opacity=None "
+                                              "percent_allowed_difference=0.01 max_n_hits=4294967295 mode=0 return_forward_info=False "
+                                              "first_R_then_T=False")):
+        parameters = inspect.signature(function).parameters.values()
+        assert " ".join(p.name if p.default is p.empty else f"{p.name}={p.default}" for p in parameters) == text
 
 
 def test_the_four_lengths_of_the_camera_vector() -> None:

@@ -10,7 +10,11 @@ transmittance below 1e-4, and `means2D.grad` per half image (NDC). Different:
 | `rotations` | taken as they are, of unit length | normalised; the gradient is that of the normalised |
 | `viewmatrix`, `campos` | no gradient | the gradient (of campos by way of the harmonics) |
 | principal point in `projmatrix` | moves splats, not the limits of their shape's Jacobian | moves both |
+| where alpha is clamped | the gradient as if it were not | 0, the gradient |
+| beyond 1.3 times the field of view, where the shape's Jacobian is limited | its off-diagonal twice in the gradient by depth | the gradient |
 | colours | 3 channels | any number |
+| results | without inverse depths in the version of 2023 | always with |
+| `dc` (one of its branches) | the first coefficients, apart from `shs` | not there: give all as `shs` |
 | splats that are not finite | NaN in the image | left out, gradient 0 |
 | `debug`, `prefiltered` | write a dump; trap | nothing |
 """

@@ -9,6 +9,7 @@ from collections import UserDict
 from collections.abc import Callable
 from typing import Any
 
+import numpy
 import torch
 from torch import Tensor
 from tsplat_reference import camera_centers
@@ -99,12 +100,15 @@ def rasterization(means: Tensor, quats: Tensor | None, scales: Tensor | None, op
     check_choice("render_mode", render_mode, RENDER_MODES)
     check_choice("rasterize_mode", rasterize_mode, ("classic", "antialiased"))
     check_size("tile_size", tile_size)
+    # numpy's, as gsplat's own parser of fisheye captures has them
+    width, height = (int(v) if isinstance(v, numpy.integer) else v for v in (width, height))
     if covars is not None:
         check_tensor("covars", covars, (..., 3, 3))
         covars = covars.flatten(-2)[..., TRIANGLE]
     batch, N, C = check_scene(means, covars, quats, scales, viewmats, Ks)
     check_tensor("opacities", opacities, (*batch, N), like=means)
     _check_colors(colors, means, batch, N, C, sh_degree)
+    backgrounds = backgrounds if "RGB" in render_mode else None         # that of depth is 0, whatever the shape
     if backgrounds is not None:
         check_tensor("backgrounds", backgrounds, (*batch, C, colors.shape[-1]), like=means)
     if sparse_grad and (not packed or batch):
@@ -133,8 +137,7 @@ def rasterization(means: Tensor, quats: Tensor | None, scales: Tensor | None, op
     if render_mode != "RGB":
         channels.append(depths[..., None])
     if backgrounds is not None:
-        backgrounds = backgrounds.reshape(images, -1) if channels[0] is view_colors else backgrounds.new_zeros(images, 0)
-        backgrounds = torch.nn.functional.pad(backgrounds, (0, int(render_mode != "RGB")))
+        backgrounds = torch.nn.functional.pad(backgrounds.reshape(images, -1), (0, int(render_mode != "RGB")))
     color = torch.cat(channels, -1)
 
     ids, offsets = _bins(means2d, radii, conics, view_opacities, depths, color, images, width, height, layout)

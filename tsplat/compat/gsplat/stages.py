@@ -133,8 +133,13 @@ def rasterize_to_pixels(means2d: Tensor, conics: Tensor, colors: Tensor, opaciti
         check_tensor("backgrounds", backgrounds, (*images, colors.shape[-1]), like=means2d)
     if masks is not None and masks.shape != isect_offsets.shape:
         raise ValueError(f"masks: expected shape {list(isect_offsets.shape)}; got {list(masks.shape)}")
+    check_size("tile_size", tile_size)
+    tile_height, tile_width = isect_offsets.shape[-2:]
+    if tile_width * tile_size < image_width or tile_height * tile_size < image_height:
+        raise ValueError(f"isect_offsets: expected tiles of {tile_size} that cover {image_width} x {image_height} pixels; "
+                         f"got {tile_width} x {tile_height}")
     ids, offsets, tile = core_lists(isect_offsets, flatten_ids, masks, image_width, image_height, tile_size)
-    I, tiles = math.prod(images), isect_offsets.shape[-2] * isect_offsets.shape[-1]
+    I, tiles = math.prod(images), tile_height * tile_width
     layout = None
     if packed:                                          # the image of a splat is that of the tiles that list it
         tile_of = torch.searchsorted(isect_offsets.reshape(-1).long(), torch.arange(len(flatten_ids), device=ids.device), right=True) - 1
@@ -149,7 +154,10 @@ def rasterize_to_pixels(means2d: Tensor, conics: Tensor, colors: Tensor, opaciti
 
 def draw(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, backgrounds: Tensor | None, ids: Tensor, offsets: Tensor,
          images: int, width: int, height: int, tile: int, layout: Packed | None, absgrad: bool) -> tuple[Tensor, Tensor]:
-    """Blend by lists of the core: images `[I, H, W, D]` and alphas `[I, H, W, 1]`. With `absgrad`, backward sets `means2d.absgrad`."""
+    """Blend by lists of the core: images `[I, H, W, D]` and alphas `[I, H, W, 1]`. With `absgrad`, backward sets `means2d.absgrad`.
+
+    The image is a copy of what backward reads, as training loops write into it (`colors[~masks] = 0`).
+    """
     m, c, o, f = per_image(images, layout, means2d, conics, opacities, colors)
     probe = None
     if absgrad:
@@ -157,7 +165,7 @@ def draw(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, bac
         probe.register_hook(  # type: ignore[no-untyped-call]
             lambda v: setattr(means2d, "absgrad", v.view_as(means2d) if layout is None else layout.gather(v)))
     color, alpha = ops.blend(m, c, o, f, backgrounds, probe, ids, offsets, width, height, tile, ALPHA_MAX, True)
-    return color, alpha[..., None]
+    return color.clone() if color.requires_grad else color, alpha[..., None]
 
 
 def per_image(images: int, layout: Packed | None, means2d: Tensor, *values: Tensor) -> list[Tensor]:

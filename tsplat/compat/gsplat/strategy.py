@@ -126,6 +126,8 @@ class DefaultStrategy(Strategy):
         missing = [key for key in ("width", "height", "n_cameras", "radii", "gaussian_ids", self.key_for_gradient) if key not in info]
         if missing:
             raise ValueError(f"info: expected {missing} in it; got {sorted(info)}")
+        if packed != (info["gaussian_ids"] is not None):
+            raise ValueError(f"packed: expected {not packed}, as given to rasterization (True by default); got {packed}")
         means2d, radii = info[self.key_for_gradient], info["radii"]
         gradient: Tensor = means2d.absgrad if self.absgrad else means2d.grad
         n, device = len(params["means"]), gradient.device

@@ -58,7 +58,7 @@ def workers(worth: bool = True) -> Iterator[OrderedMap]:
 
 def map_chunks(function: Callable[[slice], R], n: int, size: int) -> list[R]:
     """`function` of the slices of `size` rows that make up n rows."""
-    with workers() as ordered_map:
+    with workers(n > size) as ordered_map:
         return list(ordered_map(function, [slice(i, i + size) for i in range(0, n, size)]))
 
 

@@ -77,7 +77,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_fit(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_fit)
-    parser.description = ("Fit Gaussians to posed photos. Writes scene.ply, metrics.json, config.json, curves.png, test/*.png (held-out "
+    parser.description = ("Fit Gaussians, or spheres, to posed photos. Writes scene.ply, metrics.json, config.json, curves.png, test/*.png (held-out "
                           "photo beside render), contact.png and checkpoint.pt, from which the same command goes on after an interruption.")
     data = parser.add_mutually_exclusive_group(required=True)
     data.add_argument("data", nargs="?", metavar="DATA", help="folder of a COLMAP model with photos, or of a transforms.json")

@@ -12,7 +12,7 @@ from functools import partial
 from pathlib import Path
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 import tsplat
 from tsplat.fit.spheres import gamma_at, refine
@@ -38,37 +38,24 @@ def arguments(doc: str | None, picture: str, **options: float) -> argparse.Argum
     return parser
 
 
-class Spheres(nn.Module):
-    """N spheres in the parameters that Adam moves: positions, logarithms of radii, logits of opacities, and features as they are."""
+class Spheres(tsplat.Spheres):
+    """`tsplat.Spheres`, with the steps between which they are optimised."""
 
-    def __init__(self, positions: Tensor, radii: Tensor, features: Tensor, opacities: Tensor) -> None:
-        super().__init__()
-        self.positions, self.log_radii = nn.Parameter(positions.clone()), nn.Parameter(radii.log())
-        self.features, self.opacity_logits = nn.Parameter(features.clone()), nn.Parameter(opacities.logit())
-
-    def __len__(self) -> int:
-        return len(self.positions)
-
-    @property
-    def radii(self) -> Tensor:
-        """`[N]`, above 0."""
-        return self.log_radii.exp()
-
-    @property
-    def opacities(self) -> Tensor:
-        """`[N]`, in (0, 1)."""
-        return self.opacity_logits.sigmoid()
+    @staticmethod
+    def of(positions: Tensor, radii: Tensor, features: Tensor, opacities: Tensor) -> Spheres:
+        """From radii and opacities, `[N]` each."""
+        return Spheres(positions, radii.log(), opacities.logit(), features)
 
     @torch.no_grad()
     def select(self, keep: Tensor) -> Spheres:
         """Only those of a mask or with these indices."""
-        return Spheres(self.positions[keep], self.radii[keep], self.features[keep], self.opacities[keep])
+        return Spheres.of(self.positions[keep], self.radii[keep], self.features[keep], self.opacities[keep])
 
     @torch.no_grad()
     def refined(self, reach: float) -> Spheres:
         """Each split into 12 that inherit its features and opacity."""
         positions, radii, parents = refine(self.positions, self.radii, reach)
-        return Spheres(positions, radii, self.features[parents], self.opacities[parents])
+        return Spheres.of(positions, radii, self.features[parents], self.opacities[parents])
 
     @torch.no_grad()
     def relocated(self, alive: Tensor, generator: torch.Generator) -> Spheres:
@@ -84,21 +71,10 @@ class Spheres(nn.Module):
     @torch.no_grad()
     def with_features(self, features: Tensor) -> Spheres:
         """The same with other features."""
-        spheres = Spheres(self.positions, self.radii, features, self.opacities)
+        spheres = Spheres.of(self.positions, self.radii, features, self.opacities)
         for name, parameter in spheres.named_parameters():
             parameter.requires_grad_(self.get_parameter(name).requires_grad)
         return spheres
-
-    def save(self, path: Path) -> None:
-        """To a file of torch's, in a folder that is made if need be."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        torch.save(self.state_dict(), path)
-
-    @staticmethod
-    def load(path: Path) -> Spheres:
-        """From a file that `save` wrote."""
-        state = torch.load(path, weights_only=True)
-        return Spheres(state["positions"], state["log_radii"].exp(), state["features"], state["opacity_logits"].sigmoid())
 
     def groups(self, size: float, speed: float = 1.0) -> list[dict[str, object]]:
         """Adam's parameter groups: positions move in proportion to the scene's size."""

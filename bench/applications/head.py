@@ -34,12 +34,13 @@ def load(data: Path, downscale: float) -> tuple[Views, Views]:
 def main(argv: list[str] | None = None) -> Result:
     """Reconstruct, print and draw."""
     parser = arguments(__doc__, "head.png", steps=200, batch=1, volume=4000, refinements=2, downscale=2.0, reach=1.0)
-    parser.add_argument("--spheres", type=Path, default=ROOT / "out" / "head.pt", help="a file for the spheres (default: out/head.pt)")
+    parser.add_argument("--spheres", type=Path, default=ROOT / "out" / "head.ply", help="a file for the spheres (default: out/head.ply)")
     args = parser.parse_args(argv)
     start, generator = time.process_time(), torch.Generator().manual_seed(args.seed)
     stage, (train, test) = stage_of_head(), load(args.data, args.downscale)
     result = reconstruct(stage, train, test, volume=args.volume, refinements=args.refinements, steps=args.steps, batch=args.batch,
                          reach=args.reach, generator=generator, say=lambda line: print(f"head, {line}", flush=True))
+    args.spheres.parent.mkdir(parents=True, exist_ok=True)
     result.spheres.save(args.spheres)
     some = test[torch.tensor([0, 3, 6, 9])]
     with torch.no_grad():

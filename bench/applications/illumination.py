@@ -107,13 +107,13 @@ def main(argv: list[str] | None = None) -> tuple[float, float]:
     eyes = DISTANCE * normalize(torch.randn(args.cameras, 3, generator=generator), dim=1)
     cameras = orbit(eyes, args.size, FOV)
     radius = 4 / math.sqrt(args.samples)
-    dense = Spheres(surface.points - radius * surface.normals, torch.full((args.samples,), radius), with_alpha(surface.normals),
+    dense = Spheres.of(surface.points - radius * surface.normals, torch.full((args.samples,), radius), with_alpha(surface.normals),
                     torch.full((args.samples,), 0.9999))                                    # they touch the surface from within
     with torch.no_grad():
         views = Views(cameras, shade(torch.stack([stage.render(dense, cameras[i], SHARP) for i in range(args.cameras)])))
 
     outwards = normalize(torch.randn(args.spheres, 3, generator=generator), dim=1)
-    spheres = Spheres(0.6 * outwards, torch.full((args.spheres,), 2.0 / math.sqrt(args.spheres)), with_alpha(outwards),
+    spheres = Spheres.of(0.6 * outwards, torch.full((args.spheres,), 2.0 / math.sqrt(args.spheres)), with_alpha(outwards),
                       torch.full((args.spheres,), 0.5))
 
     def render(spheres: Spheres, cameras: tsplat.Camera, gamma: float) -> Tensor:

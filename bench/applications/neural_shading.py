@@ -45,7 +45,7 @@ class Decoder(nn.Module):
 def main(argv: list[str] | None = None) -> tuple[float, float, float]:
     """Optimise the colours, then features and network, print and draw."""
     parser = arguments(__doc__, "neural_shading.png", steps=150, batch=1, downscale=2.0)
-    parser.add_argument("--spheres", type=Path, default=ROOT / "out" / "head.pt", help="what head.py wrote (default: out/head.pt)")
+    parser.add_argument("--spheres", type=Path, default=ROOT / "out" / "head.ply", help="what head.py wrote (default: out/head.ply)")
     args = parser.parse_args(argv)
     if not args.spheres.is_file():
         head.main(["--data", str(args.data), "--spheres", str(args.spheres), "--seed", str(args.seed)])

@@ -31,7 +31,7 @@ def random_volume(count: int, stage: Stage, generator: torch.Generator, overlap:
     directions = torch.nn.functional.normalize(torch.randn(count, 3, generator=generator), dim=1)
     distances = stage.radius * torch.rand(count, 1, generator=generator) ** (1 / 3)
     radii = torch.full((count,), overlap * stage.radius / count ** (1 / 3))
-    return Spheres(stage.centre + directions * distances, radii, torch.full((count, 3), 0.5), torch.full((count,), 0.5))
+    return Spheres.of(stage.centre + directions * distances, radii, torch.full((count, 3), 0.5), torch.full((count,), 0.5))
 
 
 def prune(spheres: Spheres, stage: Stage, views: Views, gamma: float) -> Spheres:

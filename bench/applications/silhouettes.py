@@ -62,7 +62,7 @@ def main(argv: list[str] | None = None) -> float:
     train, test = views[~held_out], views[held_out]
     positions = 0.5 * cube_sphere(args.segments)
     n = len(positions)
-    spheres = Spheres(positions, torch.full((n,), 0.6 / args.segments), torch.ones(n, 1), torch.full((n,), 0.5))
+    spheres = Spheres.of(positions, torch.full((n,), 0.6 / args.segments), torch.ones(n, 1), torch.full((n,), 0.5))
     stage = Stage(torch.zeros(3), RADIUS, 2.732, torch.zeros(1))
 
     def loss(spheres: Spheres, some: Views, gamma: float) -> Tensor:

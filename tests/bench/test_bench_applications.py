@@ -61,7 +61,7 @@ def test_chamfer_distance(application: ModuleType) -> None:
 
 @pytest.mark.parametrize("application", ["head"], indirect=True)
 def test_head_and_its_neural_shading(application: ModuleType, shared: Path, tmp_path: Path) -> None:
-    spheres = tmp_path / "made" / "head.pt"
+    spheres = tmp_path / "made" / "head.ply"
     result = application.main(options(shared, tmp_path, f"--steps 8 --volume 200 --refinements 1 --downscale 8 --spheres {spheres}"))
     names, counts, quality = zip(*result.history, strict=True)
     assert names == ("volume", "volume, pruned", "refinement 1, before", "refinement 1", "refinement 1, pruned")

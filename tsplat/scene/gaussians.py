@@ -54,11 +54,6 @@ class Gaussians(Splats):
         return self.log_scales.exp()
 
     @property
-    def opacities(self) -> Tensor:
-        """`[N]` in 0..1."""
-        return self.opacity_logits.sigmoid()
-
-    @property
     def sh(self) -> Tensor:
         """`[N, K, 3]` spherical-harmonic coefficients."""
         return torch.cat([self.sh0, self.sh_rest], dim=1)

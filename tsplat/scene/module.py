@@ -12,6 +12,8 @@ from torch import Tensor, nn
 class Splats(nn.Module):
     """N splats of some kind: parameters `[N, ...]`, which a kind names in `NAMES` and checks in `check`."""
 
+    opacity_logits: nn.Parameter    # of all kinds
+
     NAMES: ClassVar[tuple[str, ...]] = ()
 
     def __init__(self, **tensors: Tensor) -> None:
@@ -22,6 +24,11 @@ class Splats(nn.Module):
 
     def __len__(self) -> int:
         return self.get_parameter(self.NAMES[0]).shape[0]
+
+    @property
+    def opacities(self) -> Tensor:
+        """`[N]` in 0..1."""
+        return self.opacity_logits.sigmoid()
 
     @property
     def device(self) -> torch.device:

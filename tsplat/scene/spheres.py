@@ -62,11 +62,6 @@ class Spheres(Splats):
         """`[N]`, world units."""
         return self.log_radii.exp()
 
-    @property
-    def opacities(self) -> Tensor:
-        """`[N]` in 0..1."""
-        return self.opacity_logits.sigmoid()
-
     def render(self, camera: Camera, *, gamma: float | Tensor | None = None, **options: Any) -> SphereRendering:
         """`tsplat.render_spheres` of these spheres, with their own gamma, near and far.
 

@@ -7,6 +7,7 @@ from typing import Any
 import pytest
 
 from tsplat.fit import FitConfig
+from tsplat.fit.schedules import regulariser_weights
 
 
 @pytest.mark.parametrize(("field", "value"), [
@@ -29,3 +30,18 @@ def test_fields_are_documented_and_fixed() -> None:
     assert all(item.metadata["help"] for item in dataclasses.fields(config))
     with pytest.raises(dataclasses.FrozenInstanceError):
         config.steps = 3            # type: ignore[misc]
+
+
+@pytest.mark.parametrize(("config", "opacity", "scale"), [
+    ({}, 0.01, 0.0), ({"density": "mcmc"}, 0.01, 0.01), ({"density": "adaptive"}, 0.0, 0.0), ({"primitive": "spheres"}, 0.0, 0.0),
+    ({"opacity_reg": 0.0}, 0.0, 0.0), ({"density": "adaptive", "opacity_reg": 0.3, "scale_reg": 0.2}, 0.3, 0.2)])
+def test_regularisers_end_with_density_control(config: dict[str, Any], opacity: float, scale: float) -> None:
+    chosen = FitConfig(steps=100, density_stop=0.4, opacity_depth_reg=0.5, **config)
+    for step in (0, 39):
+        assert regulariser_weights(chosen, step) == {"opacity": opacity, "scale": scale, "opacity_depth": 0.5}
+    for step in (40, 99):
+        assert regulariser_weights(chosen, step) == {"opacity": 0.0, "scale": 0.0, "opacity_depth": 0.5}
+
+
+def test_regularisers_without_density_control_go_on() -> None:
+    assert regulariser_weights(FitConfig(steps=10, density="none", opacity_reg=0.1), 9)["opacity"] == 0.1

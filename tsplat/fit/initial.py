@@ -18,9 +18,9 @@ def initial_gaussians(capture: Capture, config: FitConfig, generator: torch.Gene
     """Round Gaussians at the `initial_points`, as in 3DGS (section 5.1)."""
     splats = Gaussians.from_points(*initial_points(capture, config, generator), config.sh_degree)
     with torch.no_grad():
-        opacity = config.published("init_opacity")
+        opacity = config.value("init_opacity")
         splats.opacity_logits.fill_(math.log(opacity / (1 - opacity)))
-        splats.log_scales.add_(math.log(config.published("init_scale")))
+        splats.log_scales.add_(math.log(config.value("init_scale")))
     return splats
 
 

@@ -40,7 +40,7 @@ class Primitive(Protocol):
         """Render as at `step`, or (None) as finished."""
         ...
 
-    def regulariser(self, scene: Scene, rendering: Any, config: FitConfig, extent: float) -> Tensor | None:
+    def regulariser(self, scene: Scene, rendering: Any, extent: float, weights: Mapping[str, float]) -> Tensor | None:
         """What the loss has besides the photo."""
         ...
 
@@ -71,10 +71,9 @@ class GaussianPrimitive:
         return draw(scene, camera, background, sh_degree=degree, antialiased=config.antialiased, depth="accumulated" if depth else None,
                     probes=probes)
 
-    def regulariser(self, scene: Scene, rendering: Rendering, config: FitConfig, extent: float) -> Tensor | None:
+    def regulariser(self, scene: Scene, rendering: Rendering, extent: float, weights: Mapping[str, float]) -> Tensor | None:
         """See `scene_regulariser`."""
-        return scene_regulariser(scene.opacities, scene.scales, rendering.meta, extent, opacity=config.published("opacity_reg"),
-                                 scale=config.published("scale_reg"), opacity_depth=config.opacity_depth_reg)
+        return scene_regulariser(scene.opacities, scene.scales, rendering.meta, extent, **weights)
 
     def rates(self, config: FitConfig, extent: float, step: int) -> dict[str, float]:
         """See `learning_rates`."""

@@ -47,6 +47,13 @@ def density_schedule(config: FitConfig) -> Schedule:
     return Schedule(max(1, round(config.density_start * config.steps)), round(config.density_stop * config.steps), every)
 
 
+def regulariser_weights(config: FitConfig, step: int) -> dict[str, float]:
+    """Of `scene_regulariser`. Those of opacity and scale make splats fade for density control to recycle, and end with it."""
+    acting = config.density == "none" or step < density_schedule(config).stop
+    return {"opacity": acting * config.value("opacity_reg"), "scale": acting * config.value("scale_reg"),
+            "opacity_depth": config.opacity_depth_reg}
+
+
 def reset_interval(config: FitConfig) -> int:
     """Steps between resets of the opacities; 0: none."""
     return round(config.reset_every * config.steps / REFERENCE_STEPS)

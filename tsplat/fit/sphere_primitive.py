@@ -61,10 +61,9 @@ class SpherePrimitive:
             distances = torch.cdist(few, eyes.to(few)).flatten()[:SAMPLE]
             low, high = torch.quantile(distances, torch.tensor([OUTLIERS, 1 - OUTLIERS])).tolist()
             near, far = NEAREST * low, FARTHEST * high
-        opacity = 0.5 if config.init_opacity is None else config.init_opacity
-        spheres = Spheres.from_points(points, colors, opacity, gamma=config.gamma_last, near=near, far=far)
+        spheres = Spheres.from_points(points, colors, config.value("init_opacity"), gamma=config.gamma_last, near=near, far=far)
         with torch.no_grad():
-            spheres.log_radii.add_(math.log(1.0 if config.init_scale is None else config.init_scale))
+            spheres.log_radii.add_(math.log(config.value("init_scale")))
         return spheres
 
     def load(self, saved: dict[str, Any]) -> Spheres:
@@ -84,10 +83,9 @@ class SpherePrimitive:
         depths = (scene.positions * viewmats[:, None, 2, :3]).sum(-1) + viewmats[:, None, 2, 3]
         return SphereDrawing(r.image, r.alpha, None, SphereMeta(r.visible.view(len(viewmats), -1), depths))
 
-    def regulariser(self, scene: Spheres, rendering: SphereDrawing, config: FitConfig, extent: float) -> Tensor | None:
+    def regulariser(self, scene: Spheres, rendering: SphereDrawing, extent: float, weights: Mapping[str, float]) -> Tensor | None:
         """See `scene_regulariser`."""
-        return scene_regulariser(scene.opacities, scene.radii, rendering.meta, extent, opacity=config.opacity_reg or 0.0,
-                                 scale=config.scale_reg or 0.0, opacity_depth=config.opacity_depth_reg)
+        return scene_regulariser(scene.opacities, scene.radii, rendering.meta, extent, **weights)
 
     def rates(self, config: FitConfig, extent: float, step: int) -> dict[str, float]:
         """`RATES`, times `rate_factor`; that of the positions falls as that of Gaussians' means."""

@@ -25,7 +25,7 @@ from tsplat.fit.output import Output
 from tsplat.fit.primitive import Scene, primitive_of
 from tsplat.fit.progress import progress_line
 from tsplat.fit.report import write_sheet
-from tsplat.fit.schedules import divisor_at
+from tsplat.fit.schedules import divisor_at, regulariser_weights
 from tsplat.fit.state import FitState
 from tsplat.fit.stream import PhotoStream
 from tsplat.fit.turntable import write_turntable
@@ -182,7 +182,7 @@ def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStr
     loss = photo_loss(state.photos.expose(rendering.image, view), target, config.ssim_weight)
     if truth is not None and rendering.depth is not None:
         loss = loss + config.depth_weight * depth_loss(rendering.depth, rendering.alpha, truth.to(device))
-    regulariser = primitive.regulariser(scene, rendering, config, extent)
+    regulariser = primitive.regulariser(scene, rendering, extent, regulariser_weights(config, state.step))
     loss = loss if regulariser is None else loss + regulariser
     state.adam.zero_grad()
     state.photos.zero_grad()

@@ -1,0 +1,127 @@
+"""The README's code runs, and does what the text beside it says; what it links to is there."""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+import tsplat
+from tsplat.cli import main
+from tsplat.scene import read_image
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+SIZE = {"width": 64, "height": 48}
+POINT = torch.tensor([0.3, -0.2, 0.1])              # of the world, seen by all cameras below
+
+
+def section(title: str) -> list[str]:
+    """The code of a section."""
+    text = README.split(f"\n## {title}\n")
+    assert len(text) == 2, title
+    return re.findall(r"```python\n(.*?)```", text[1].split("\n## ")[0], re.DOTALL)
+
+
+def run(code: str, **names: Any) -> dict[str, Any]:
+    space = {"torch": torch, "math": math, "tsplat": tsplat, **SIZE, **names}
+    exec(code, space)
+    return space
+
+
+def pixel(camera: tsplat.Camera) -> Tensor:
+    p = camera.viewmats[:3, :3] @ POINT + camera.viewmats[:3, 3]
+    assert p[2] > 0
+    return (camera.Ks @ p)[:2] / p[2]
+
+
+def camera_to_world() -> Tensor:
+    """Of a camera at (1, 0.5, 3), turned, with OpenGL's axes: right, up, back."""
+    eye = torch.tensor([1.0, 0.5, 3.0])
+    back = torch.nn.functional.normalize(eye, dim=0)
+    right = torch.nn.functional.normalize(torch.linalg.cross(torch.tensor([0.1, 1.0, 0.0]), back), dim=0)
+    c2w = torch.eye(4)
+    c2w[:3, :3], c2w[:3, 3] = torch.stack([right, torch.linalg.cross(back, right), back], 1), eye
+    return c2w
+
+
+def opengl_pixel(c2w: Tensor, focal: float, point: Tensor = POINT) -> Tensor:
+    """Where a point is on the image, by the definition: along the axes right, up and back."""
+    right, up, back = c2w[:3, :3].T @ (point - c2w[:3, 3])
+    return torch.stack([SIZE["width"] / 2 + focal * right / -back, SIZE["height"] / 2 - focal * up / -back])
+
+
+def test_rendering_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    tsplat.Gaussians.from_points(torch.randn(50, 3) * 0.3, torch.rand(50, 3), 0).save(tmp_path / "scene.ply")
+    [code] = section("Render a scene")
+    names = run(code)
+    assert (names["scene"].means.grad != 0).any()
+    assert read_image(tmp_path / "picture.png").shape == (600, 800, 3)
+
+
+def test_spheres() -> None:
+    [code] = section("Spheres: Pulsar")
+    assert float(run(code)["rendering"].alpha.max()) > 0.5
+
+
+def test_conventions() -> None:
+    """Each conversion puts a point on the pixel that the other's own rules give."""
+    opengl, colmap, nerfstudio, pytorch3d = section("Conventions")
+    c2w, angle = camera_to_world(), 0.9
+    focal = SIZE["width"] / (2 * math.tan(angle / 2))
+    K = torch.tensor([[focal, 0, 32.0], [0, focal, 24.0], [0, 0, 1]])
+    expected = opengl_pixel(c2w, focal)
+    torch.testing.assert_close(pixel(run(opengl, c2w=c2w, camera_angle_x=angle)["camera"]), expected)
+
+    half_turn = math.radians(35)                                                # about y, with COLMAP's rule: x' = R x + t
+    R = torch.tensor([[math.cos(2 * half_turn), 0, math.sin(2 * half_turn)], [0, 1, 0], [-math.sin(2 * half_turn), 0, math.cos(2 * half_turn)]])
+    tx, ty, tz = (shift := torch.tensor([0.1, 0.2, 3.0])).tolist()
+    seen = R @ POINT + shift
+    camera = run(colmap, qw=math.cos(half_turn), qx=0.0, qy=math.sin(half_turn), qz=0.0, tx=tx, ty=ty, tz=tz, fx=50.0, fy=60.0, cx=31.0, cy=25.0)["camera"]
+    torch.testing.assert_close(pixel(camera), torch.stack([31 + 50 * seen[0] / seen[2], 25 + 60 * seen[1] / seen[2]]))
+
+    turned = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+    transform, scale = torch.cat([turned, torch.tensor([[0.3], [-0.1], [0.2]])], 1), 0.4
+    camera = run(nerfstudio, transform=transform, scale=scale, c2w=c2w, K=K)["camera"]
+    moved = scale * (transform[:, :3] @ POINT + transform[:, 3])                 # the point in nerfstudio's world: on the same pixel
+    p = camera.viewmats[:3, :3] @ moved + camera.viewmats[:3, 3]
+    torch.testing.assert_close((camera.Ks @ p)[:2] / p[2], expected)
+    torch.testing.assert_close(camera.viewmats[:3, :3] @ camera.viewmats[:3, :3].T, torch.eye(3), atol=1e-6, rtol=0)
+
+    R, T, f, px, py = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)))[0], torch.tensor([0.1, -0.2, 4.0]), 1.7, 0.1, -0.2
+    R = R * torch.linalg.det(R)
+    x, y, z = POINT @ R + T
+    ndc = torch.stack([f * x / z + px, f * y / z + py])                          # x to the left, y up, in half the shorter side
+    camera = run(pytorch3d, R=R, T=T, focal_length=f, px=px, py=py)["camera"]
+    torch.testing.assert_close(pixel(camera), torch.tensor([32.0, 24.0]) - 24 * ndc)
+
+
+def test_no_code_is_left_out() -> None:
+    """The sections above, and that of the peers, whose code tests/compat runs."""
+    tested = ["Render a scene", "Spheres: Pulsar", "Conventions", "Coming from gsplat, Inria or Pulsar"]
+    assert sum(len(section(title)) for title in tested) == README.count("```python")
+
+
+def test_commands_are_known(capsys: pytest.CaptureFixture[str]) -> None:
+    """Every option of a `tsplat` command in the README is one that its help lists."""
+    commands = re.findall(r"`?(?:\.venv/bin/)?\btsplat (fit|eval|render|convert|info|compare|view)\b([^`\n]*)", README)
+    assert {"fit", "render", "info", "convert"} <= {name for name, _ in commands}
+    for name in {name for name, _ in commands}:
+        with pytest.raises(SystemExit):
+            main([name, "--help"])
+        text = capsys.readouterr().out
+        for option in {option for other, rest in commands if other == name for option in re.findall(r"(?<!\S)--?[a-z][\w-]*", rest)}:
+            assert re.search(rf"(?<![\w-]){re.escape(option)}(?![\w-])", text), (name, option)
+
+
+def test_links_lead_somewhere() -> None:
+    links = re.findall(r"\]\(([^)#]+)\)", README)
+    assert len(links) > 5
+    for link in links:
+        assert link.startswith("https://") or (ROOT / link).exists(), link

@@ -94,8 +94,7 @@ def test_conventions() -> None:
     torch.testing.assert_close((camera.Ks @ p)[:2] / p[2], expected)
     torch.testing.assert_close(camera.viewmats[:3, :3] @ camera.viewmats[:3, :3].T, torch.eye(3), atol=1e-6, rtol=0)
 
-    R, T, f, px, py = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(0)))[0], torch.tensor([0.1, -0.2, 4.0]), 1.7, 0.1, -0.2
-    R = R * torch.linalg.det(R)
+    R, T, f, px, py = camera_to_world()[:3, :3], torch.tensor([0.1, -0.2, 4.0]), 1.7, 0.1, -0.2      # any rotation
     x, y, z = POINT @ R + T
     ndc = torch.stack([f * x / z + px, f * y / z + py])                          # x to the left, y up, in half the shorter side
     camera = run(pytorch3d, R=R, T=T, focal_length=f, px=px, py=py)["camera"]

@@ -54,7 +54,7 @@ def _ellipsoid(fig: Figure, camera: tsplat.Camera, mean: torch.Tensor, covarianc
     axes.set_title(r"in space: $\Sigma = R S S^\top R^\top$, at 2 sigma")
 
 
-def _ellipse(axes, camera: tsplat.Camera, p: reference.Projection, mean: torch.Tensor, covariance: torch.Tensor) -> None:  # noqa: ANN001
+def _ellipse(axes, camera: tsplat.Camera, p: reference.Projection, mean: torch.Tensor, covariance: torch.Tensor) -> None:
     points = mean + torch.randn(1500, 3, generator=torch.Generator().manual_seed(0)) @ torch.linalg.cholesky(covariance).T
     view = points @ camera.viewmats[:3, :3].T + camera.viewmats[:3, 3]
     pixel = view @ camera.Ks.T
@@ -86,7 +86,7 @@ def _pixels(fig: Figure, mean: torch.Tensor, quat: torch.Tensor, scale: torch.Te
     axes.set_title(f"in pixels: alpha, and the {int(hits.sum())} tiles that it hits")
 
 
-def _frame(axes) -> None:  # noqa: ANN001
+def _frame(axes) -> None:
     axes.set_xlim(0, WIDTH)
     axes.set_ylim(HEIGHT, 0)
     axes.set_aspect("equal")

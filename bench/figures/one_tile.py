@@ -49,7 +49,7 @@ def draw() -> Figure:
     return fig
 
 
-def _footprints(axes, p: reference.Projection, splats: torch.Tensor, colors: torch.Tensor, corner: tuple[int, int]) -> None:  # noqa: ANN001
+def _footprints(axes, p: reference.Projection, splats: torch.Tensor, colors: torch.Tensor, corner: tuple[int, int]) -> None:
     angle = torch.linspace(0, 2 * torch.pi, 60)
     circle = torch.stack([angle.cos(), angle.sin()])
     for i in reversed(splats.tolist()):
@@ -65,7 +65,7 @@ def _footprints(axes, p: reference.Projection, splats: torch.Tensor, colors: tor
     axes.set_title(f"the tile's list: {len(splats)} splats, at 1 sigma")
 
 
-def _light(axes, alpha: torch.Tensor, before: torch.Tensor, weight: torch.Tensor) -> None:  # noqa: ANN001
+def _light(axes, alpha: torch.Tensor, before: torch.Tensor, weight: torch.Tensor) -> None:
     place = torch.arange(1, len(alpha) + 1)
     axes.bar(place, alpha, width=1.0, color=GREY, alpha=0.35, label=r"$\alpha_i$")
     axes.bar(place, weight, width=1.0, color=BLUE, label=r"weight $w_i = \alpha_i T_i$")

@@ -83,7 +83,8 @@ def test_conventions() -> None:
     R = torch.tensor([[math.cos(2 * half_turn), 0, math.sin(2 * half_turn)], [0, 1, 0], [-math.sin(2 * half_turn), 0, math.cos(2 * half_turn)]])
     tx, ty, tz = (shift := torch.tensor([0.1, 0.2, 3.0])).tolist()
     seen = R @ POINT + shift
-    camera = run(colmap, qw=math.cos(half_turn), qx=0.0, qy=math.sin(half_turn), qz=0.0, tx=tx, ty=ty, tz=tz, fx=50.0, fy=60.0, cx=31.0, cy=25.0)["camera"]
+    quaternion = {"qw": math.cos(half_turn), "qx": 0.0, "qy": math.sin(half_turn), "qz": 0.0}
+    camera = run(colmap, **quaternion, tx=tx, ty=ty, tz=tz, fx=50.0, fy=60.0, cx=31.0, cy=25.0)["camera"]
     torch.testing.assert_close(pixel(camera), torch.stack([31 + 50 * seen[0] / seen[2], 25 + 60 * seen[1] / seen[2]]))
 
     turned = torch.tensor([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])

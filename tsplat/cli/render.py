@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import math
 from pathlib import Path
 
@@ -68,10 +67,7 @@ def _capture_camera(data: str, index: int, size: tuple[int, int] | None) -> Came
     if not 0 <= index < len(capture):
         raise ValueError(f"--index: expected 0 to {len(capture) - 1}, as {data} has {len(capture)} photos; got {index}")
     camera = capture.camera(index)
-    if size is None:
-        return camera
-    Ks = camera.Ks * torch.tensor([[size[0] / camera.width], [size[1] / camera.height], [1.0]])
-    return dataclasses.replace(camera, Ks=Ks, width=size[0], height=size[1])
+    return camera if size is None else camera.resized(*size)
 
 
 def _framing_cameras(means: Tensor, count: int, up: tuple[float, ...], size: tuple[int, int], fov: float) -> list[Camera]:

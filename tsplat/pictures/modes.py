@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from typing import Literal, NamedTuple, TypeAlias, get_args
 
 import torch
@@ -17,6 +18,7 @@ Scene: TypeAlias = Gaussians | Spheres
 Mode = Literal["color", "depth", "alpha", "normals"]
 MODES: tuple[Mode, ...] = get_args(Mode)
 SOLID = 0.5                 # alpha from which a pixel has a normal, and a depth that counts
+PROBE = 128                 # pixels of the longer side of the views that `depth_range` looks at
 QUANTILES = 0.01, 0.99      # of solid depths: what near and far are, so that a few stray splats do not take all the colours
 
 
@@ -74,7 +76,8 @@ def picture(layers: Layers, camera: Camera, mode: Mode = "color", *, background:
         camera: which they were drawn with.
         mode: one of the above.
         background: `[3]` in 0..1, or None for a picture with alpha.
-        depth_range: camera z of near and far, or None for the `depth_range_of` this view. A clip needs one for all, lest it flicker.
+        depth_range: camera z of near and far, or None for what `depth_range` finds in this
+            view. A clip needs one for all, lest it flicker.
 
     Returns:
         `[H, W, 3]` in 0..1, or with alpha `[H, W, 4]`, whose colours are not multiplied by it. The picture of alpha has 3 channels.
@@ -90,7 +93,7 @@ def picture(layers: Layers, camera: Camera, mode: Mode = "color", *, background:
     elif layers.depth is None:
         raise ValueError(f"layers: expected depth for the mode {mode!r}; got None")
     elif mode == "depth":
-        near, far = depth_range_of([layers]) if depth_range is None else depth_range
+        near, far = _range_of([layers]) if depth_range is None else depth_range
         if not 0 <= near < far:
             raise ValueError(f"depth_range: expected 0 <= near < far; got {near} and {far}")
         colors = viridis((far - layers.depth) / (far - near)) * alpha
@@ -103,8 +106,20 @@ def picture(layers: Layers, camera: Camera, mode: Mode = "color", *, background:
     return torch.cat([colors / alpha.clamp(min=1e-6), alpha], -1).clamp(0, 1)
 
 
-def depth_range_of(views: list[Layers]) -> tuple[float, float]:
-    """Near and far for pictures of these views: the 1% and the 99% quantile of depth where alpha is at least 0.5; 0 and 1 if it never is."""
+def depth_range(scene: Scene, cameras: Iterable[Camera], *, antialiased: bool = False) -> tuple[float, float]:
+    """Near and far for pictures of all these views, which are rendered for it at no more than 128 pixels a side.
+
+    The 1% and the 99% quantile of camera z over all pixels whose alpha is at least 0.5; 0 and 1 if there is none.
+    """
+    views = []
+    for camera in cameras:
+        scale = min(1.0, PROBE / max(camera.width, camera.height))
+        size = (max(1, round(scale * side)) for side in (camera.width, camera.height))
+        views.append(draw_layers(scene, camera.resized(*size), antialiased=antialiased))
+    return _range_of(views)
+
+
+def _range_of(views: Sequence[Layers]) -> tuple[float, float]:
     depths = torch.cat([view.depth[view.alpha >= SOLID] for view in views if view.depth is not None]).sort().values
     if not len(depths):
         return 0.0, 1.0

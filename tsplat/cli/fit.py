@@ -47,8 +47,14 @@ def run(options: argparse.Namespace) -> None:
         if not (data / "sparse" / "0" / "points3D.txt").exists():              # the file that is written last
             print(f"rendering a small capture of a made-up scene to {data}")
             write_synthetic_capture(data)
-    result = fit(data, config, options.out, resume=not options.fresh, progress=sys.stderr.isatty() and not options.quiet,
-                 device=device_of(options.device))
+    try:
+        result = fit(data, config, options.out, resume=not options.fresh, progress=sys.stderr.isatty() and not options.quiet,
+                     device=device_of(options.device))
+    except KeyboardInterrupt as interrupt:
+        checkpoint = options.out / "checkpoint.pt"
+        if not interrupt.args and checkpoint.exists():                         # while reading photos, or in the evaluation
+            raise KeyboardInterrupt(f"interrupted; the same command goes on from {checkpoint}") from None
+        raise
     print_mean(result.qualities)
     if result.refined_mean is not None:
         print(f"with their poses refined, too: PSNR {result.refined_mean.psnr:.2f} dB, SSIM {result.refined_mean.ssim:.4f}")

@@ -84,7 +84,8 @@ def test_names_that_the_terminal_cannot_show(tmp_path: Path) -> None:
     """A stdout of ASCII only, which raises an error for any other letter, is written to all the same."""
     Gaussians.random(5).save(tmp_path / "ä.ply")
     code = "import io, sys; sys.stdout = io.TextIOWrapper(sys.stdout.buffer, 'ascii'); from tsplat.cli import main; sys.exit(main(sys.argv[1:]))"
-    done = subprocess.run([sys.executable, "-c", code, "convert", tmp_path / "ä.ply", tmp_path / "ö.splat"], env=BARE, capture_output=True, timeout=120)
+    command = [sys.executable, "-c", code, "convert", tmp_path / "ä.ply", tmp_path / "ö.splat"]
+    done = subprocess.run(command, env=BARE, capture_output=True, timeout=120)
     assert done.returncode == 0, done.stderr.decode()
     assert rb"\xf6.splat" in done.stdout
     assert (tmp_path / "ö.splat").exists()

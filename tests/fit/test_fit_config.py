@@ -32,16 +32,17 @@ def test_fields_are_documented_and_fixed() -> None:
         config.steps = 3            # type: ignore[misc]
 
 
-@pytest.mark.parametrize(("config", "opacity", "scale"), [
-    ({}, 0.01, 0.0), ({"density": "mcmc"}, 0.01, 0.01), ({"density": "adaptive"}, 0.0, 0.0), ({"primitive": "spheres"}, 0.0, 0.0),
-    ({"opacity_reg": 0.0}, 0.0, 0.0), ({"density": "adaptive", "opacity_reg": 0.3, "scale_reg": 0.2}, 0.3, 0.2)])
-def test_regularisers_end_with_density_control(config: dict[str, Any], opacity: float, scale: float) -> None:
+@pytest.mark.parametrize(("config", "random_start", "opacity", "scale"), [
+    ({}, True, 0.01, 0.0), ({}, False, 0.0, 0.0), ({"density": "mcmc"}, False, 0.01, 0.01), ({"density": "mcmc"}, True, 0.01, 0.01),
+    ({"density": "adaptive"}, True, 0.0, 0.0), ({"primitive": "spheres"}, True, 0.0, 0.0), ({"opacity_reg": 0.0}, True, 0.0, 0.0),
+    ({"density": "adaptive", "opacity_reg": 0.3, "scale_reg": 0.2}, False, 0.3, 0.2)])
+def test_regularisers_end_with_density_control(config: dict[str, Any], random_start: bool, opacity: float, scale: float) -> None:
     chosen = FitConfig(steps=100, density_stop=0.4, opacity_depth_reg=0.5, **config)
     for step in (0, 39):
-        assert regulariser_weights(chosen, step) == {"opacity": opacity, "scale": scale, "opacity_depth": 0.5}
+        assert regulariser_weights(chosen, step, random_start=random_start) == {"opacity": opacity, "scale": scale, "opacity_depth": 0.5}
     for step in (40, 99):
-        assert regulariser_weights(chosen, step) == {"opacity": 0.0, "scale": 0.0, "opacity_depth": 0.5}
+        assert regulariser_weights(chosen, step, random_start=random_start) == {"opacity": 0.0, "scale": 0.0, "opacity_depth": 0.5}
 
 
 def test_regularisers_without_density_control_go_on() -> None:
-    assert regulariser_weights(FitConfig(steps=10, density="none", opacity_reg=0.1), 9)["opacity"] == 0.1
+    assert regulariser_weights(FitConfig(steps=10, density="none", opacity_reg=0.1), 9, random_start=False)["opacity"] == 0.1

@@ -33,7 +33,7 @@ def initial_points(capture: Capture, config: FitConfig, generator: torch.Generat
     """
     most = config.max_splats or math.inf
     count = int(min(config.splats, most))
-    if capture.points is None or not len(capture.points):
+    if capture.points is None or not capture.has_points:
         low, high = (torch.tensor(corner) for corner in view_cube(capture))
         return low + (high - low) * torch.rand(count, 3, generator=generator), torch.rand(count, 3, generator=generator)
     points, colors = capture.points, capture.point_colors

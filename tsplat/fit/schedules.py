@@ -47,11 +47,11 @@ def density_schedule(config: FitConfig) -> Schedule:
     return Schedule(max(1, round(config.density_start * config.steps)), round(config.density_stop * config.steps), every)
 
 
-def regulariser_weights(config: FitConfig, step: int) -> dict[str, float]:
+def regulariser_weights(config: FitConfig, step: int, *, random_start: bool) -> dict[str, float]:
     """Of `scene_regulariser`. Those of opacity and scale make splats fade for density control to recycle, and end with it."""
     acting = config.density == "none" or step < density_schedule(config).stop
-    return {"opacity": acting * config.value("opacity_reg"), "scale": acting * config.value("scale_reg"),
-            "opacity_depth": config.opacity_depth_reg}
+    opacity, scale = (acting * config.value(name, random_start=random_start) for name in ("opacity_reg", "scale_reg"))
+    return {"opacity": opacity, "scale": scale, "opacity_depth": config.opacity_depth_reg}
 
 
 def reset_interval(config: FitConfig) -> int:

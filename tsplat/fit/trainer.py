@@ -6,7 +6,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -182,7 +182,8 @@ def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStr
     loss = photo_loss(state.photos.expose(rendering.image, view), target, config.ssim_weight)
     if truth is not None and rendering.depth is not None:
         loss = loss + config.depth_weight * depth_loss(rendering.depth, rendering.alpha, truth.to(device))
-    regulariser = primitive.regulariser(scene, rendering, extent, regulariser_weights(config, state.step))
+    weights = regulariser_weights(config, state.step, random_start=not capture.has_points)
+    regulariser = primitive.regulariser(scene, rendering, extent, weights)
     loss = loss if regulariser is None else loss + regulariser
     state.adam.zero_grad()
     state.photos.zero_grad()
@@ -239,8 +240,7 @@ def _reduced(camera: Camera, target: Target, divisor: int) -> tuple[Camera, Targ
     if divisor == 1:
         return camera, target
     width, height = (max(1, round(side / divisor)) for side in (camera.width, camera.height))
-    scale = camera.Ks.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
-    return replace(camera, Ks=camera.Ks * scale, width=width, height=height), target.resized(width, height)
+    return camera.resized(width, height), target.resized(width, height)
 
 
 def _check_finite(loss: float, modules: Sequence[nn.Module], where: str) -> None:

@@ -73,6 +73,11 @@ class Capture:
         return None if path is None else read_depth(path, width, height)
 
     @property
+    def has_points(self) -> bool:
+        """Whether there are sparse points to start from."""
+        return self.points is not None and len(self.points) > 0
+
+    @property
     def extent(self) -> float:
         """1.1 times the largest distance of a camera from the mean camera position; 1 if all are at one place."""
         rotations, translations = self.viewmats[:, :3, :3], self.viewmats[:, :3, 3:]

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import resource
 import statistics
 import subprocess
@@ -22,7 +21,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from output import add_json, print_json, printing
+from output import add_json, environment, print_json, printing
 from scenes import Scene, count_pairs, random_scene
 
 import tsplat
@@ -81,6 +80,7 @@ def table(rows: list[tuple[int, int, int]]) -> list[dict[str, float]]:
         pairs = row["pairs"] = count_pairs(random_scene(n, width, height))
         f, b, scale = row["forward_ms"], row["both_ms"], RIVAL_EXP_RATE / row["exp_rate"]
         rival = [ms * scale for ms in RIVAL_MS[width, height, n]]
+        row["rival_ms"] = rival
         print(f"| {width}x{height} | {n:,} | {pairs / 1e6:.2f} | {f:.0f} | {b:.0f} | {pairs / f / 1e3:.0f} | {pairs / b / 1e3:.0f} | "
               f"{pairs / f * 1e3 / row['exp_rate']:.4f} | {pairs / b * 1e3 / row['exp_rate']:.4f} | {rival[0]:.0f} / {rival[1]:.0f} | "
               f"{f / rival[0]:.2f} / {b / rival[1]:.2f} |", flush=True)
@@ -129,8 +129,9 @@ def main() -> None:
 
 
 def measure_all(threads: int, *, quick: bool) -> dict[str, Any]:
-    print(f"torch {torch.__version__}, {threads} threads, {platform.machine()}, exp {exp_rate() / 1e9:.2f} G/s\n")
-    results: dict[str, Any] = {"torch": torch.__version__, "threads": threads, "rows": table(QUICK if quick else list(RIVAL_MS))}
+    results = environment("cpu")
+    print(f"torch {results['torch']}, {threads} threads, {results['machine']}, exp {exp_rate() / 1e9:.2f} G/s\n")
+    results["rows"] = table(QUICK if quick else list(RIVAL_MS))
     if not quick:
         results["growth"] = growth()
         command = [sys.executable, __file__, "--large-only", "--json", "--threads", str(threads)]

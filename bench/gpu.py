@@ -13,7 +13,6 @@ Without a GPU it says so and exits with 2.
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
 import os
 import statistics
@@ -25,7 +24,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from output import add_json, print_json, printing
+from output import add_json, environment, print_json, printing
 from scenes import Scene, random_scene
 from torch import Tensor
 
@@ -68,7 +67,7 @@ def main() -> int:
 def measure_all(args: argparse.Namespace) -> dict[str, Any]:
     """The report, which is also written."""
     device = torch.device("cuda")
-    report: dict[str, Any] = {**environment(), "copy_GBps": copy_bandwidth(device)}
+    report: dict[str, Any] = {**environment("cuda"), "copy_GBps": copy_bandwidth(device)}
     print(json.dumps(report, indent=1))
     if not args.no_tests:
         report["tests"] = subprocess.run([sys.executable, "-m", "pytest", "-q"], cwd=ROOT, stdout=sys.stdout).returncode    # where print goes
@@ -88,15 +87,6 @@ def measure_all(args: argparse.Namespace) -> dict[str, Any]:
     stem.with_suffix(".md").write_text(markdown(report))
     print(markdown(report))
     return report
-
-
-def environment() -> dict[str, Any]:
-    """Device, versions, commit and date."""
-    import triton
-
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
-    return {"device": torch.cuda.get_device_name(), "torch": torch.__version__, "triton": triton.__version__, "commit": commit,
-            "date": datetime.date.today().isoformat()}
 
 
 def fixed_scenes(data: Path, quick: bool) -> list[tuple[str, Scene, int]]:
@@ -295,7 +285,7 @@ def measure_gsplat(scene: Scene, leaves: list[Tensor], v_image: Tensor, image: T
 
 
 def markdown(report: dict[str, Any]) -> str:
-    lines = [f"# {report['device']}, {report['date']}, commit {report['commit']}", "",
+    lines = [f"# {report['machine']}, {report['date']}, commit {report['commit']}", "",
              f"torch {report['torch']}, Triton {report['triton']}, copy {report['copy_GBps']:.0f} GB/s. Medians of CUDA events, ms.", "",
              "| scene | channels | project | bin | blend | forward | fwd+bwd | MiB | gsplat fwd | fwd+bwd | MiB | times as fast |",
              "| --- " * 12 + "|"]

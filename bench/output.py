@@ -1,12 +1,34 @@
-"""Of all scripts that measure: `--json`, with which a document is all that stdout gets."""
+"""Of all scripts that measure: `--json`, with which a document is all that stdout gets, and what the figures in it hold for."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import datetime
 import json
+import platform
+import subprocess
 import sys
+from pathlib import Path
 from typing import Any
+
+import torch
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def environment(device: str) -> dict[str, Any]:
+    """Kind of device and its name, versions, threads, command, commit and date."""
+    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
+    machine, versions = f"{platform.machine()} CPU", {"torch": torch.__version__}
+    if device == "cuda":
+        import triton
+
+        machine, versions["triton"] = torch.cuda.get_device_name(), triton.__version__
+    script = Path(sys.argv[0]).resolve()
+    command = ["python", script.relative_to(ROOT).as_posix() if script.is_relative_to(ROOT) else script.name, *sys.argv[1:]]
+    return {"device": device, "machine": machine, **versions, "threads": torch.get_num_threads(), "command": " ".join(command),
+            "commit": commit, "date": datetime.date.today().isoformat()}
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

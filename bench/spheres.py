@@ -17,13 +17,10 @@ CPU, resident.
 from __future__ import annotations
 
 import argparse
-import datetime
 import json
 import math
-import platform
 import resource
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -34,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from output import add_json, print_json, printing
+from output import add_json, environment, print_json, printing
 from torch import Tensor
 
 import tsplat
@@ -220,14 +217,6 @@ def markdown(report: dict[str, Any], figure: str | None) -> str:
     return "\n".join([*lines, *(["", f"![time over number of spheres]({figure})"] if figure else [])]) + "\n"
 
 
-def environment(device: str, threads: int) -> dict[str, Any]:
-    """What the figures hold for."""
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True).stdout.strip()
-    machine = torch.cuda.get_device_name() if device == "cuda" else f"{platform.machine()} CPU"
-    return {"device": device, "machine": machine, "torch": torch.__version__, "threads": threads, "commit": commit,
-            "date": datetime.date.today().isoformat()}
-
-
 def main() -> None:
     """Measure, then write JSON, markdown and the figure."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -259,15 +248,14 @@ def measure_all(args: argparse.Namespace) -> dict[str, Any]:
     """The report, which is also written."""
     args.out.mkdir(parents=True, exist_ok=True)
     times = args.times or (20 if args.device == "cuda" else 1 if args.large else 3)
-    report = environment(args.device, args.threads)
-    report["command"] = "python bench/spheres.py" + (" --quick" if args.quick else "")
+    report = environment(args.device) | {"threads": args.threads}
     report["times"], report["clock"] = times, "cpu" if args.busy and args.device == "cpu" else "wall"
     report["rows"] = []
     name = "cpu" if args.device == "cpu" else report["machine"].removeprefix("NVIDIA ").lower().replace(" ", "-")
     stem = args.out / f"{report['date']}-spheres-{name}"
     if args.large and stem.with_suffix(".json").is_file():
-        report["rows"] = json.loads(stem.with_suffix(".json").read_text())["rows"]
-        report["command"] += "` and `python bench/spheres.py --large"
+        earlier = json.loads(stem.with_suffix(".json").read_text())
+        report["rows"], report["command"] = earlier["rows"], f"{earlier['command']}` and `{report['command']}"
     setups = LARGE if args.large else [TABLE[0], TABLE[2], FIGURE[0], FIGURE[2]] if args.quick else [*TABLE, *FIGURE]
     measured = {(setup.part, setup.spheres) for setup in setups}
     report["rows"] = [row for row in report["rows"] if (row["part"], row["spheres"]) not in measured]

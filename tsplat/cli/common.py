@@ -7,14 +7,12 @@ import dataclasses
 import json
 import typing
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import torch
 
 from tsplat.fit import FitConfig, Quality
 from tsplat.fit.evaluation import mean_quality
-from tsplat.fit.output import read_config
 from tsplat.scene.formats import FORMATS
 
 SCENE = f"a scene file ({', '.join(item.suffix for item in FORMATS)})"
@@ -48,10 +46,10 @@ def _add_field(group: argparse._ArgumentGroup, item: dataclasses.Field[Any], kin
         group.add_argument(flag, type=kind, default=argparse.SUPPRESS, metavar=kind.__name__.upper(), help=text)
 
 
-def config_of(options: argparse.Namespace, path: Path | None) -> FitConfig:
-    """What the options say, on top of what the file says."""
+def config_of(options: argparse.Namespace, base: FitConfig) -> FitConfig:
+    """What the options say, on top of another config."""
     given = {item.name: getattr(options, item.name) for item in dataclasses.fields(FitConfig) if hasattr(options, item.name)}
-    return FitConfig(**given) if path is None else dataclasses.replace(read_config(path), **given)
+    return dataclasses.replace(base, **given)
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:

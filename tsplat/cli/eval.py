@@ -7,8 +7,8 @@ import dataclasses
 from pathlib import Path
 
 from tsplat.cli.common import SCENE, add_device, add_fields, add_json, config_of, device_of, print_json, print_qualities
-from tsplat.fit import evaluate
-from tsplat.fit.output import metrics_of, write_json
+from tsplat.fit import FitConfig, evaluate
+from tsplat.fit.output import metrics_of, read_config, write_json
 from tsplat.scene import Spheres, load_capture, load_scene
 
 HELP = "measure a scene file against held-out photos"
@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
     beside = options.scene.with_name("config.json")
-    config = config_of(options, beside if beside.is_file() else None)
+    config = config_of(options, read_config(beside) if beside.is_file() else FitConfig())
     scene = load_scene(options.scene).to(device_of(options.device))
     config = dataclasses.replace(config, primitive="spheres" if isinstance(scene, Spheres) else "gaussians")
     capture = load_capture(options.data, downscale=config.downscale, test_every=config.test_every)

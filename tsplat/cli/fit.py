@@ -7,7 +7,8 @@ import sys
 from pathlib import Path
 
 from tsplat.cli.common import add_device, add_fields, config_of, device_of, print_mean
-from tsplat.fit import fit
+from tsplat.fit import FitConfig, fit
+from tsplat.fit.output import read_config
 from tsplat.scene import write_synthetic_capture
 
 HELP = "fit a scene to photos"
@@ -40,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    config = config_of(options, options.config)
+    config = config_of(options, FitConfig() if options.config is None else read_config(options.config))
     data = options.data
     if options.synthetic:
         data = options.out / "capture"

@@ -88,11 +88,6 @@ class Camera:
         """As `torch.Tensor.to`, for the two matrices."""
         return dataclasses.replace(self, viewmats=self.viewmats.to(*args, **kwargs), Ks=self.Ks.to(*args, **kwargs))  # type: ignore[call-overload]
 
-    def resized(self, width: int, height: int) -> Camera:
-        """The same view as an image of another size, in pixels. Where the shape of the image changes, so does that of a pixel."""
-        scale = self.Ks.new_tensor([[width / self.width], [height / self.height], [1.0]])
-        return dataclasses.replace(self, Ks=self.Ks * scale, width=width, height=height)
-
     @staticmethod
     def look_at(eye: Sequence[float] | Tensor, target: Sequence[float] | Tensor, up: Sequence[float] | Tensor = (0.0, -1.0, 0.0), *,
                 width: int, height: int, fov: float = 50.0, dtype: torch.dtype = torch.float32) -> Camera:

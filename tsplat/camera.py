@@ -88,6 +88,11 @@ class Camera:
         """As `torch.Tensor.to`, for the two matrices."""
         return dataclasses.replace(self, viewmats=self.viewmats.to(*args, **kwargs), Ks=self.Ks.to(*args, **kwargs))  # type: ignore[call-overload]
 
+    def resized(self, width: int, height: int) -> Camera:
+        """The same view in pictures of another size: the intrinsics are scaled, along both axes by themselves."""
+        scale = self.Ks.new_tensor([[width / self.width], [height / self.height], [1.0]])
+        return dataclasses.replace(self, Ks=self.Ks * scale, width=width, height=height)
+
     @staticmethod
     def look_at(eye: Sequence[float] | Tensor, target: Sequence[float] | Tensor, up: Sequence[float] | Tensor = (0.0, -1.0, 0.0), *,
                 width: int, height: int, fov: float = 50.0, dtype: torch.dtype = torch.float32) -> Camera:

@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 import torch
 
-import tsplat.cli
 from tsplat.cli import main
 from tsplat.fit import FitConfig
 from tsplat.scene import Gaussians, read_image, write_synthetic_capture
@@ -50,7 +49,7 @@ def test_fit_synthetic(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: 
         written.append(folder)
         return write_synthetic_capture(folder, views=4, size=(32, 24))
 
-    monkeypatch.setattr(tsplat.cli, "write_synthetic_capture", small)
+    monkeypatch.setattr("tsplat.cli.fit.write_synthetic_capture", small)
     for _ in range(2):
         assert run("fit", "--synthetic", "-o", tmp_path, *SHORT) == 0
     assert written == [tmp_path / "capture"]                           # once

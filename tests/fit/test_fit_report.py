@@ -13,8 +13,8 @@ from tsplat.fit import FitConfig, fit, to_writer
 from tsplat.fit.plot import HEIGHT, WIDTH, curves
 from tsplat.fit.report import History, write_sheet
 from tsplat.fit.turntable import turntable
+from tsplat.pictures.gif import LEVELS, _lzw, write_gif
 from tsplat.scene import Capture, read_image, write_image
-from tsplat.scene.gif import LEVELS, _lzw, write_gif
 
 Make = Callable[..., FitConfig]
 

@@ -6,7 +6,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -239,8 +239,7 @@ def _reduced(camera: Camera, target: Target, divisor: int) -> tuple[Camera, Targ
     if divisor == 1:
         return camera, target
     width, height = (max(1, round(side / divisor)) for side in (camera.width, camera.height))
-    scale = camera.Ks.new_tensor([[width / camera.width], [height / camera.height], [1.0]])
-    return replace(camera, Ks=camera.Ks * scale, width=width, height=height), target.resized(width, height)
+    return camera.resized(width, height), target.resized(width, height)
 
 
 def _check_finite(loss: float, modules: Sequence[nn.Module], where: str) -> None:

@@ -13,8 +13,8 @@ from tsplat.fit.config import FitConfig
 from tsplat.fit.drawing import fixed_background
 from tsplat.fit.initial import view_cube
 from tsplat.fit.primitive import Scene, primitive_of
+from tsplat.pictures.clip import write_clip
 from tsplat.scene import Capture
-from tsplat.scene.gif import write_gif
 
 MAX_SIDE = 480         # pixels of a frame
 FPS = 20.0
@@ -47,10 +47,10 @@ def turntable(capture: Capture, frames: int) -> list[Camera]:
 
 @torch.no_grad()
 def write_turntable(path: Path, scene: Scene, capture: Capture, config: FitConfig, frames: int) -> None:
-    """Write the turn as an animated GIF."""
+    """Write the turn as a clip (`tsplat.pictures.write_clip`)."""
     device, primitive = scene.device, primitive_of(config)
     background = fixed_background(config).to(device)
-    write_gif(path, [primitive.draw(scene, camera.to(device), background, config).image.cpu() for camera in turntable(capture, frames)], FPS)
+    write_clip(path, (primitive.draw(scene, camera.to(device), background, config).image for camera in turntable(capture, frames)), FPS)
 
 
 def _unit(vector: Tensor, otherwise: Tensor) -> Tensor:

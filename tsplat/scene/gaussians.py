@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from tsplat.camera import Camera
 from tsplat.checks import check_tensor
+from tsplat.rasterize import Rendering, rasterize
 from tsplat.scene.module import Splats
 from tsplat.scene.neighbours import nearest_squared_distances
 
@@ -62,6 +65,15 @@ class Gaussians(Splats):
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 4."""
         return math.isqrt(self.sh_rest.shape[1] + 1) - 1
+
+    def render(self, camera: Camera, **options: Any) -> Rendering:
+        """`tsplat.rasterize` of these Gaussians, with all bands of their colours.
+
+        Args:
+            camera: one or a batch.
+            options: further arguments of `tsplat.rasterize`.
+        """
+        return rasterize(self.means, self.quats, self.scales, self.opacities, self.sh, camera, sh_degree=self.sh_degree, **options)
 
     def extra_repr(self) -> str:
         """What `repr` shows."""

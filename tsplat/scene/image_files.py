@@ -103,9 +103,13 @@ def write_image(path: str | os.PathLike[str], image: Tensor) -> None:
 
     from kornia.io import write_image as write
 
-    pixels = image.detach().cpu().nan_to_num(0.0, 1.0, 0.0).clamp(0, 1).mul(255).round().to(torch.uint8)
     with replacing(path) as temporary:
         try:
-            write(temporary, pixels.permute(2, 0, 1).contiguous())
+            write(temporary, to_bytes(image).permute(2, 0, 1).contiguous())
         except Exception as error:                                                 # kornia_rs raises bare exceptions
             raise OSError(f"{path}: cannot be written; {error}") from None
+
+
+def to_bytes(image: Tensor) -> Tensor:
+    """Floating point in 0..1 (clamped; NaN as 0) as uint8 of the same shape, on the CPU."""
+    return image.detach().cpu().nan_to_num(0.0, 1.0, 0.0).clamp(0, 1).mul(255).round().to(torch.uint8)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import struct
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -19,8 +20,8 @@ MAX_CODE = 4096
 BAYER = torch.tensor([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]]) / 16 + 1 / 32
 
 
-def write_gif(path: str | os.PathLike[str], frames: Sequence[Tensor], fps: float = 20.0) -> None:
-    """Write an endless animation. An older file stays until the new one is whole.
+def write_gif(path: str | os.PathLike[str], frames: Iterable[Tensor], fps: float = 25.0) -> None:
+    """Write an endless animation, frame by frame. An older file stays until the new one is whole.
 
     Args:
         path: ends in `.gif`; its folder exists.
@@ -33,20 +34,24 @@ def write_gif(path: str | os.PathLike[str], frames: Sequence[Tensor], fps: float
     """
     if not os.fspath(path).lower().endswith(".gif"):
         raise ValueError(f"{os.fspath(path)}: expected a file name that ends in .gif")
-    if not frames or not 0 < fps <= 100:
-        raise ValueError(f"frames, fps: expected at least 1 frame, and above 0 to 100 per second; got {len(frames)} and {fps}")
-    for frame in frames:
-        check_tensor("frames", frame, (*frames[0].shape[:2], 3))
-    height, width = frames[0].shape[:2]
+    if not 0 < fps <= 100:
+        raise ValueError(f"fps: expected above 0 and up to 100 frames per second in a GIF; got {fps}")
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None:
+        raise ValueError("frames: expected at least 1 frame; got none")
+    check_tensor("frames", first, ("H", "W", 3))
+    height, width = first.shape[:2]
     if not 1 <= min(height, width) <= max(height, width) < 1 << 16:
         raise ValueError(f"frames: expected 1 to 65535 pixels a side; got {width}x{height}")
-    parts = [b"GIF89a", struct.pack("<HHBBB", width, height, 0xF7, 0, 0), _palette(),
-             b"\x21\xFF\x0BNETSCAPE2.0\x03\x01\x00\x00\x00"]                                        # for ever
-    for frame in frames:
-        parts += [struct.pack("<BBBBHBB", 0x21, 0xF9, 4, 0, round(100 / fps), 0, 0),
-                  struct.pack("<BHHHHBB", 0x2C, 0, 0, width, height, 0, 8), _blocks(_lzw(_indices(frame))), b"\x00"]
-    with replacing(path) as temporary:
-        temporary.write_bytes(b"".join([*parts, b"\x3B"]))
+    control = struct.pack("<BBBBHBB", 0x21, 0xF9, 4, 0, round(100 / fps), 0, 0)
+    place = struct.pack("<BHHHHBB", 0x2C, 0, 0, width, height, 0, 8)
+    with replacing(path) as temporary, temporary.open("wb") as file:
+        file.write(b"GIF89a" + struct.pack("<HHBBB", width, height, 0xF7, 0, 0) + _palette() + b"\x21\xFF\x0BNETSCAPE2.0\x03\x01\x00\x00\x00")
+        for frame in itertools.chain([first], frames):
+            check_tensor("frames", frame, (height, width, 3))
+            file.write(control + place + _blocks(_lzw(_indices(frame))) + b"\x00")
+        file.write(b"\x3B")
 
 
 def _palette() -> bytes:

@@ -7,7 +7,7 @@ import pytest
 
 import tsplat.viewer.loop
 from tsplat.scene import Gaussians, Spheres
-from tsplat.viewer import RenderLoop, Settings, picture
+from tsplat.viewer import RenderLoop, Settings, draw_view
 from tsplat.viewer.schedule import Frame, Visitor, Wish
 from tsplat.viewer.viewpoint import Viewpoint
 
@@ -46,7 +46,7 @@ def test_two_visitors_at_once_see_what_they_look_at(loop: RenderLoop, gaussians:
     loop.show(gaussians)
     for eye, w in zip((a, b), wishes, strict=True):
         wait(eye.sharp(w), "the sharp picture")
-        want = picture(gaussians, w.viewpoint.camera(), w.settings)
+        want = draw_view(gaussians, w.viewpoint.camera(), w.settings)
         assert (eye.frames[-1].pixels == want).all()
         assert (loop.sharp(w) == want).all()
         assert [frame.divisor for frame in eye.frames] == sorted((f.divisor for f in eye.frames), reverse=True)
@@ -63,7 +63,7 @@ def test_a_new_scene_is_drawn_for_all_who_are_there(loop: RenderLoop, gaussians:
     loop.leave(leaves.visitor)
     count = len(leaves.frames)
     loop.show(spheres)
-    want = picture(spheres, wish().viewpoint.camera(), Settings())
+    want = draw_view(spheres, wish().viewpoint.camera(), Settings())
     wait(lambda: stays.frames[-1].divisor == 1 and (stays.frames[-1].pixels == want).all(), "the picture of the spheres")
     assert len(leaves.frames) == count
     assert loop.visitors == 1
@@ -76,7 +76,7 @@ def test_a_picture_that_fails_does_not_end_the_others(loop: RenderLoop, gaussian
 
     eye = Eye(loop)
     with monkeypatch.context() as patch:
-        patch.setattr(tsplat.viewer.loop, "picture", fails)
+        patch.setattr(tsplat.viewer.loop, "draw_view", fails)
         loop.show(gaussians)
         loop.wish(eye.visitor, wish())
         wait(lambda: eye.visitor.shown == 1, "the failures")

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from tsplat.viewer.picture import Settings
 from tsplat.viewer.schedule import DIVISORS, PROMPT, REST, Frame, Job, Schedule, Visitor, Wish
+from tsplat.viewer.view import Settings
 from tsplat.viewer.viewpoint import Viewpoint
 
 

@@ -12,10 +12,11 @@ import torch
 import viser
 
 from tsplat.camera import Camera
+from tsplat.pictures import MODES
 from tsplat.scene import write_image
 from tsplat.viewer.loop import RenderLoop
-from tsplat.viewer.picture import MODES, Pixels, Settings
 from tsplat.viewer.schedule import Frame, Wish
+from tsplat.viewer.view import Pixels, Settings
 from tsplat.viewer.viewpoint import Viewpoint, stance
 from tsplat.viewer.views import Views
 

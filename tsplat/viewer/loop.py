@@ -8,8 +8,8 @@ import traceback
 from collections.abc import Callable
 from types import TracebackType
 
-from tsplat.viewer.picture import Pixels, Scene, picture
 from tsplat.viewer.schedule import Frame, Job, Schedule, Visitor, Wish
+from tsplat.viewer.view import Pixels, Scene, draw_view
 
 
 class RenderLoop:
@@ -73,7 +73,7 @@ class RenderLoop:
 
     def sharp(self, wish: Wish) -> Pixels | None:
         """The picture of a wish at its full resolution, drawn by the calling thread; None as long as there is no scene."""
-        return None if self._scene is None else picture(self._scene, wish.viewpoint.camera(), wish.settings)
+        return None if self._scene is None else draw_view(self._scene, wish.viewpoint.camera(), wish.settings)
 
     def close(self) -> None:
         """End the thread, after the picture at which it is."""
@@ -93,7 +93,7 @@ class RenderLoop:
             job, scene = work
             begin = time.monotonic()
             try:
-                pixels = picture(scene, job.wish.viewpoint.camera(job.divisor), job.wish.settings)
+                pixels = draw_view(scene, job.wish.viewpoint.camera(job.divisor), job.wish.settings)
                 job.visitor.show(Frame(pixels, job.wish, job.divisor, time.monotonic() - begin))
             except Exception:                         # one picture that fails (memory, say) must not end those of all visitors
                 traceback.print_exc()

@@ -17,8 +17,8 @@ except ImportError as error:
 
 from tsplat.viewer.controls import Controls
 from tsplat.viewer.loop import RenderLoop
-from tsplat.viewer.picture import Settings
 from tsplat.viewer.training import Report, TrainingView
+from tsplat.viewer.view import Settings
 from tsplat.viewer.viewpoint import stance
 from tsplat.viewer.views import Views
 

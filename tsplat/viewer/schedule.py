@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from tsplat.viewer.picture import Pixels, Settings
+from tsplat.viewer.view import Pixels, Settings
 from tsplat.viewer.viewpoint import Viewpoint
 
 DIVISORS = 8, 4, 2, 1

@@ -37,7 +37,7 @@ class Viewpoint(NamedTuple):
 
     def camera(self, divisor: int = 1) -> Camera:
         """In float32, at `1 / divisor` of the resolution."""
-        rotation = torch.tensor(rotation_matrix(list(self.wxyz)), dtype=torch.float64)        
+        rotation = torch.tensor(rotation_matrix(list(self.wxyz)), dtype=torch.float64)
         viewmat = torch.eye(4, dtype=torch.float64)
         viewmat[:3, :3], viewmat[:3, 3] = rotation.T, -rotation.T @ torch.tensor(self.position, dtype=torch.float64)
         f = 0.5 * self.height / math.tan(self.fov / 2)

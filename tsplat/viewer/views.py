@@ -11,7 +11,7 @@ from torch import Tensor
 from tsplat.camera import Camera
 from tsplat.fit.initial import view_cube
 from tsplat.scene import Capture, Spheres
-from tsplat.viewer.picture import Scene
+from tsplat.viewer.view import Scene
 
 
 @dataclass(frozen=True)

@@ -19,9 +19,10 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from pathlib import Path
+from typing import Any
 
 import torch
+from output import add_json, print_json, printing
 from scenes import Scene, count_pairs, random_scene
 
 import tsplat
@@ -100,7 +101,7 @@ def growth() -> list[dict[str, float]]:
     return results
 
 
-def large() -> None:
+def large() -> dict[str, float]:
     """Forward and backward of 1M splats at 1920x1080: the peak memory of a process that does nothing else."""
     n, width, height = LARGE
     baseline = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -110,6 +111,7 @@ def large() -> None:
     seconds, peak = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     print(f"\n{n:,} splats at {width}x{height}, forward+backward: {seconds:.1f} s, peak memory of the process {peak / 2**20:.2f} GiB "
           f"({baseline / 2**20:.2f} GiB of it before the first call)", flush=True)
+    return {"width": width, "height": height, "n": n, "seconds": seconds, "peak_KiB": peak, "before_KiB": baseline}
 
 
 def main() -> None:
@@ -117,19 +119,23 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="two rows only")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     parser.add_argument("--large-only", action="store_true", help="only the memory of 1M splats (run in a fresh process)")
-    parser.add_argument("--json", type=Path, help="also write the results here")
+    add_json(parser)
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    if args.large_only:
-        large()
-        return
-    print(f"torch {torch.__version__}, {args.threads} threads, {platform.machine()}, exp {exp_rate() / 1e9:.2f} G/s\n")
-    results = {"torch": torch.__version__, "threads": args.threads, "rows": table(QUICK if args.quick else list(RIVAL_MS))}
-    if not args.quick:
-        results["growth"] = growth()
-        subprocess.run([sys.executable, __file__, "--large-only", "--threads", str(args.threads)], check=True)
+    with printing(args.json):
+        results = large() if args.large_only else measure_all(args.threads, quick=args.quick)
     if args.json:
-        args.json.write_text(json.dumps(results, indent=1) + "\n")
+        print_json(results)
+
+
+def measure_all(threads: int, *, quick: bool) -> dict[str, Any]:
+    print(f"torch {torch.__version__}, {threads} threads, {platform.machine()}, exp {exp_rate() / 1e9:.2f} G/s\n")
+    results: dict[str, Any] = {"torch": torch.__version__, "threads": threads, "rows": table(QUICK if quick else list(RIVAL_MS))}
+    if not quick:
+        results["growth"] = growth()
+        command = [sys.executable, __file__, "--large-only", "--json", "--threads", str(threads)]
+        results["large"] = json.loads(subprocess.run(command, check=True, stdout=subprocess.PIPE).stdout)
+    return results
 
 
 if __name__ == "__main__":

@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from output import add_json, print_json, printing
 from scenes import Scene, random_scene
 from torch import Tensor
 
@@ -47,20 +48,30 @@ def main() -> int:
     parser.add_argument("--quick", action="store_true", help="1080p, up to 1M splats, 3 channels only")
     parser.add_argument("--no-tests", action="store_true", help="leave out the test suite")
     parser.add_argument("--profile", action="store_true", help="only print the kernels of a forward and backward, with their times")
+    add_json(parser)
     args = parser.parse_args()
     if not torch.cuda.is_available():
         print("bench/gpu.py: no GPU: torch.cuda.is_available() is False. Run it where there is one; for a CPU there is bench/cpu.py",
               file=sys.stderr)
         return 2
-    device = torch.device("cuda")
     if args.profile:
         for name, scene, channels in fixed_scenes(args.data, True):
-            print(f"{name}, {channels} channels\n{profile(to(scene, device))}", flush=True)
+            print(f"{name}, {channels} channels\n{profile(to(scene, torch.device('cuda')))}", flush=True)
         return 0
+    with printing(args.json):
+        report = measure_all(args)
+    if args.json:
+        print_json(report)
+    return 1 if report.get("tests") else 0
+
+
+def measure_all(args: argparse.Namespace) -> dict[str, Any]:
+    """The report, which is also written."""
+    device = torch.device("cuda")
     report: dict[str, Any] = {**environment(), "copy_GBps": copy_bandwidth(device)}
     print(json.dumps(report, indent=1))
     if not args.no_tests:
-        report["tests"] = subprocess.run([sys.executable, "-m", "pytest", "-q"], cwd=ROOT).returncode
+        report["tests"] = subprocess.run([sys.executable, "-m", "pytest", "-q"], cwd=ROOT, stdout=sys.stdout).returncode    # where print goes
     report["rows"] = []
     for name, scene, channels in fixed_scenes(args.data, args.quick):
         row = {"scene": name, "channels": channels, "splats": len(scene.means), "width": scene.camera.width, "height": scene.camera.height}
@@ -76,7 +87,7 @@ def main() -> int:
     stem.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
     stem.with_suffix(".md").write_text(markdown(report))
     print(markdown(report))
-    return 1 if report.get("tests") else 0
+    return report
 
 
 def environment() -> dict[str, Any]:

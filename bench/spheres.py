@@ -34,6 +34,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from output import add_json, print_json, printing
 from torch import Tensor
 
 import tsplat
@@ -239,6 +240,7 @@ def main() -> None:
     parser.add_argument("--busy", action="store_true", help="the machine is busy: pairs/s and the figure are to be of CPU time (CPU only)")
     parser.add_argument("--no-figure", action="store_true", help="draw none (matplotlib is not needed then)")
     parser.add_argument("--out", type=Path, default=ROOT / "bench" / "results", help="folder to write to")
+    add_json(parser)
     args = parser.parse_args()
     if args.device == "cuda" and not torch.cuda.is_available():
         parser.error("--device cuda: torch.cuda.is_available() is False; use --device cpu")
@@ -247,6 +249,14 @@ def main() -> None:
             import matplotlib  # noqa: F401
         except ImportError:
             parser.error("matplotlib, which draws the figure, cannot be imported: pip install 'tsplat[bench]', or give --no-figure")
+    with printing(args.json):
+        report = measure_all(args)
+    if args.json:
+        print_json(report)
+
+
+def measure_all(args: argparse.Namespace) -> dict[str, Any]:
+    """The report, which is also written."""
     times = args.times or (20 if args.device == "cuda" else 1 if args.large else 3)
     report = environment(args.device, args.threads)
     report["command"] = "python bench/spheres.py" + (" --quick" if args.quick else "")
@@ -269,6 +279,7 @@ def main() -> None:
     stem.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")
     stem.with_suffix(".md").write_text(text)
     print(text)
+    return report
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
+import sys
 import time
 from pathlib import Path
 
@@ -15,6 +16,9 @@ from tsplat.fit.evaluation import evaluate, mean_quality
 from tsplat.scene import Capture, load_capture
 
 REPOSITORY = Path(__file__).resolve().parents[2]
+sys.path.append(str(REPOSITORY / "bench"))
+
+from output import add_json, print_json, printing  # noqa: E402
 
 
 def measure(name: str, description: str | None, config: FitConfig, parts: tuple[float, ...] = ()) -> None:
@@ -38,7 +42,9 @@ def measure(name: str, description: str | None, config: FitConfig, parts: tuple[
     parser.add_argument("--density", default=config.density)
     parser.add_argument("--resolution-warmup", type=float, default=config.resolution_warmup)
     parser.add_argument("--device", default="cpu")
+    add_json(parser)
     options = parser.parse_args()
+    fits = []
     for seed in options.seeds:
         chosen = dataclasses.replace(config, steps=options.steps, splats=options.splats, max_splats=options.max_splats, density=options.density,
                                      resolution_warmup=options.resolution_warmup, seed=seed)
@@ -48,8 +54,12 @@ def measure(name: str, description: str | None, config: FitConfig, parts: tuple[
         result = fit(capture, chosen, progress=False, callbacks=[curve], device=options.device)
         wall, cpu = time.perf_counter() - wall - curve.wall, time.process_time() - cpu - curve.cpu
         assert result.mean is not None
-        print(f"{name} seed {seed}: PSNR {result.mean.psnr:.2f} dB, SSIM {result.mean.ssim:.4f}, {len(result.gaussians)} splats, "
-              f"{chosen.steps} steps, {wall:.1f} s wall, {cpu:.1f} s CPU, {torch.get_num_threads()} threads{curve.text}", flush=True)
+        fits.append({"seed": seed, **result.mean._asdict(), "splats": len(result.gaussians), "steps": chosen.steps, "wall_s": wall, "cpu_s": cpu})
+        with printing(options.json):
+            print(f"{name} seed {seed}: PSNR {result.mean.psnr:.2f} dB, SSIM {result.mean.ssim:.4f}, {len(result.gaussians)} splats, "
+                  f"{chosen.steps} steps, {wall:.1f} s wall, {cpu:.1f} s CPU, {torch.get_num_threads()} threads{curve.text}", flush=True)
+    if options.json:
+        print_json({"capture": name, "threads": torch.get_num_threads(), "fits": fits})
 
 
 class _Curve:

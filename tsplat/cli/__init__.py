@@ -1,6 +1,6 @@
-"""The command line: `tsplat fit`, `tsplat eval`, `tsplat render`, `tsplat convert`, `tsplat info`.
+"""The command line: `tsplat fit`, `eval`, `compare`, `render`, `convert` and `info`.
 
-A command is a module here with `HELP` (one line), `add_arguments(parser)` and `run(options)`.
+A command is a module here with `HELP` (one line), `USAGE`, `DESCRIPTION`, `EXAMPLES`, `add_arguments(parser)` and `run(options)`.
 """
 
 from __future__ import annotations
@@ -12,27 +12,52 @@ import warnings
 from collections.abc import Sequence
 
 import tsplat
-from tsplat.cli import convert, eval, fit, info, render
+from tsplat.cli import compare, convert, eval, fit, info, render
+from tsplat.cli.parser import Parser
 
 INTERRUPTED = 130                    # the exit status of a shell's command that was stopped by Ctrl-C
-COMMANDS = {"fit": fit, "eval": eval, "render": render, "convert": convert, "info": info}
+UNREAD = 141                         # and of one that nobody listens to any more, as in `tsplat info scene.ply | head -1`
+COMMANDS = {"fit": fit, "eval": eval, "compare": compare, "render": render, "convert": convert, "info": info}
+DESCRIPTION = "Fit, render, compare, convert and inspect scenes of splats: Gaussians and spheres."
+EPILOG = f"""
+examples:
+  tsplat fit --synthetic -o out                            a first fit, without any data
+  tsplat fit capture -o out --downscale 4                  photos posed by COLMAP, or a transforms.json
+  tsplat render out/scene.ply -o turn.gif --orbit 60       also .png and .mp4; also depth and normals
+  tsplat info out/scene.ply --json                         JSON on stdout, and nothing else
+
+exit status:
+  0    done
+  2    an error, which the last line on stderr says
+  {INTERRUPTED}  stopped by Ctrl-C; `tsplat fit` leaves a checkpoint, and the same command goes on from it
+  {UNREAD}  what reads the output has ended (a pipe into `head`)
+
+`tsplat COMMAND --help` tells all about a command.
+"""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return its exit status: 0, 2 for an error (one line on stderr), 130 after Ctrl-C.
+    """Run a command and return its exit status: 0, 2 for an error (one line on stderr), 130 after Ctrl-C, 141 if stdout is closed.
 
     Args:
         argv: the arguments, default `sys.argv[1:]`.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if getattr(stream, "errors", None) == "strict":                    # names of files that the terminal has no letters for
+            stream.reconfigure(errors="backslashreplace")                  # type: ignore[union-attr]
     options = _parser().parse_args(argv)
     debug = options.debug or bool(os.environ.get("TSPLAT_DEBUG"))
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_: print(f"tsplat: warning: {message}", file=sys.stderr)
             options.run(options)
+            sys.stdout.flush()                                             # here, where it can still be caught that nobody reads it
     except KeyboardInterrupt as interrupt:
         print(f"tsplat: {interrupt or 'interrupted'}", file=sys.stderr)
         return INTERRUPTED
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())     # for the flush when Python ends
+        return UNREAD
     except (ValueError, OSError, ArithmeticError, NotImplementedError, MemoryError, ImportError) as error:
         if debug:
             raise
@@ -42,15 +67,15 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="tsplat", description="Fit, render, convert and inspect scenes of Gaussian splats.")
+    parser = Parser(prog="tsplat", usage="tsplat COMMAND ...", description=DESCRIPTION, epilog=EPILOG)
     parser.add_argument("--version", action="version", version=f"tsplat {tsplat.__version__}")
-    commands = parser.add_subparsers(title="commands", required=True, metavar="COMMAND")
-    shared = argparse.ArgumentParser(add_help=False)
-    shared.add_argument("--debug", action="store_true", help="show where an error came from (also: TSPLAT_DEBUG=1)")
+    commands = parser.add_subparsers(title="commands", prog="tsplat", required=True, metavar="COMMAND")
     for name, command in COMMANDS.items():
-        subparser = commands.add_parser(name, parents=[shared], help=command.HELP)
-        subparser.set_defaults(run=command.run)
+        subparser = commands.add_parser(name, help=command.HELP, usage=command.USAGE, description=command.DESCRIPTION.strip(),
+                                        epilog=f"examples:\n{command.EXAMPLES.strip(chr(10))}")
         command.add_arguments(subparser)
+        subparser.add_argument("--debug", action="store_true", help="show where an error came from (also: TSPLAT_DEBUG=1)")
+        subparser.set_defaults(run=command.run)
     return parser
 
 

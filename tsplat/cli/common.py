@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import json
 import typing
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import torch
-from torch import Tensor
 
 from tsplat.fit import FitConfig, Quality
 from tsplat.fit.evaluation import mean_quality
@@ -19,24 +20,32 @@ from tsplat.scene.formats import FORMATS
 SCENE = f"a scene file ({', '.join(item.suffix for item in FORMATS)})"
 
 
-def add_fields(parser: argparse.ArgumentParser, names: Sequence[str]) -> None:
-    """An option for each of these fields of `FitConfig`, which is not in the result if it was not given."""
+def add_fields(parser: argparse.ArgumentParser, names: Sequence[str] | None = None) -> None:
+    """An option for each field of `FitConfig`, under its topic, or for those of these names. What is not given is not in the result."""
     kinds = typing.get_type_hints(FitConfig)
+    topics: dict[str, argparse._ArgumentGroup] = {}
     for item in dataclasses.fields(FitConfig):
-        if item.name not in names:
+        if names is not None and item.name not in names:
             continue
-        kind, text = kinds[item.name], item.metadata["help"]
-        if item.default is None:                                                     # `kind | None`, of which the help says what None means
-            kind = next(k for k in typing.get_args(kind) if k is not type(None))
-        else:
-            text = f"{text} (default: {item.default:g})" if kind is float else f"{text} (default: {item.default})"
-        flag = "--" + item.name.replace("_", "-")
-        if kind is bool:
-            parser.add_argument(flag, action=argparse.BooleanOptionalAction, default=argparse.SUPPRESS, help=text)
-        elif choices := typing.get_args(kind):
-            parser.add_argument(flag, choices=choices, default=argparse.SUPPRESS, help=text)
-        else:
-            parser.add_argument(flag, type=kind, default=argparse.SUPPRESS, metavar=kind.__name__.upper(), help=text)
+        topic = item.metadata["topic"]
+        if topic not in topics:
+            topics[topic] = parser.add_argument_group(topic)
+        _add_field(topics[topic], item, kinds[item.name])
+
+
+def _add_field(group: argparse._ArgumentGroup, item: dataclasses.Field[Any], kind: Any) -> None:
+    text = item.metadata["help"]
+    if item.default is None:                                                         # `kind | None`, of which the help says what None means
+        kind = next(k for k in typing.get_args(kind) if k is not type(None))
+    else:
+        text = f"{text} (default: {item.default:g})" if kind is float else f"{text} (default: {item.default})"
+    flag = "--" + item.name.replace("_", "-")
+    if kind is bool:
+        group.add_argument(flag, action=argparse.BooleanOptionalAction, default=argparse.SUPPRESS, help=text)
+    elif choices := typing.get_args(kind):
+        group.add_argument(flag, choices=choices, default=argparse.SUPPRESS, help=text)
+    else:
+        group.add_argument(flag, type=kind, default=argparse.SUPPRESS, metavar=kind.__name__.upper(), help=text)
 
 
 def config_of(options: argparse.Namespace, path: Path | None) -> FitConfig:
@@ -58,14 +67,25 @@ def device_of(name: str) -> torch.device:
         raise ValueError(f"--device: expected a device as torch names it, such as cpu or cuda; got {name!r}") from None
 
 
-def print_mean(qualities: dict[str, Quality]) -> None:
+def add_json(parser: argparse.ArgumentParser) -> None:
+    """The option `--json`: then a command prints one document by `print_json`, and nothing else."""
+    parser.add_argument("--json", action="store_true", help="print one JSON document, and nothing else on stdout")
+
+
+def print_json(content: dict[str, Any]) -> None:
+    """As `json.tool` indents it; ValueError for what JSON has no number for."""
+    print(json.dumps(content, indent=2, allow_nan=False))
+
+
+def print_mean(qualities: dict[str, Quality], kind: str = "held-out photos") -> None:
     """One line, or none if there were no photos."""
     mean = mean_quality(qualities)
     if mean is not None:
-        print(f"{len(qualities)} held-out photos: PSNR {mean.psnr:.2f} dB, SSIM {mean.ssim:.4f}")
+        print(f"{len(qualities)} {kind}: PSNR {mean.psnr:.2f} dB, SSIM {mean.ssim:.4f}")
 
 
-def quantiles(values: Tensor, at: Sequence[float]) -> list[float]:
-    """Of non-empty `[n]`, to the nearest value."""
-    ordered = values.sort().values
-    return [float(ordered[round(q * (len(ordered) - 1))]) for q in at]
+def print_qualities(qualities: dict[str, Quality], kind: str = "held-out photos") -> None:
+    """A line for each photo, and that of the mean."""
+    for name, quality in qualities.items():
+        print(f"{name}: PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}")
+    print_mean(qualities, kind)

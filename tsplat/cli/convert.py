@@ -10,11 +10,16 @@ from tsplat.scene import Gaussians
 from tsplat.scene.formats import FORMATS
 
 HELP = "write a scene in another file format"
+USAGE = "tsplat convert IN OUT [options]"
+DESCRIPTION = "Write a scene in the format that the name of OUT says; its folder is made."
+EXAMPLES = """
+  tsplat convert scene.ply scene.spz
+  tsplat convert scene.sog scene.ply
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    parser.description = "Write a scene in the format that the name of OUT says; its folder is made."
     parser.add_argument("scene", metavar="IN", help=SCENE)
     parser.add_argument("out", type=Path, metavar="OUT", help=f"a scene file ({', '.join(item.suffix for item in FORMATS if item.write)})")
 

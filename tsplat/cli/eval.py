@@ -6,21 +6,30 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from tsplat.cli.common import SCENE, add_device, add_fields, config_of, device_of, print_mean
+from tsplat.cli.common import SCENE, add_device, add_fields, add_json, config_of, device_of, print_json, print_qualities
 from tsplat.fit import evaluate
 from tsplat.fit.output import metrics_of, write_json
 from tsplat.scene import Spheres, load_capture, load_scene
 
 HELP = "measure a scene file against held-out photos"
+USAGE = "tsplat eval SCENE DATA [options]"
+DESCRIPTION = """
+Measure a scene against the held-out photos of a capture. What is not given here
+is taken from the config.json beside the scene, if there is one: then the result
+is what metrics.json says.
+"""
+EXAMPLES = """
+  tsplat eval out/scene.ply capture
+  tsplat eval out/scene.ply capture --test-every 4 --json
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    parser.description = ("Measure a scene against the held-out photos of a capture. What is not given here is taken from the config.json "
-                          "beside the scene, if there is one: then the result is what metrics.json says.")
     parser.add_argument("scene", type=Path, metavar="SCENE", help=SCENE)
     parser.add_argument("data", metavar="DATA", help="the capture: folder or transforms.json")
     parser.add_argument("-o", "--out", type=Path, metavar="OUT.json", help="also write the metrics of each photo to this file")
+    add_json(parser)
     add_device(parser)
     add_fields(parser, ("downscale", "test_every", "background", "antialiased"))
 
@@ -35,8 +44,9 @@ def run(options: argparse.Namespace) -> None:
     if not capture.test:
         raise ValueError(f"{options.data}: expected held-out photos; there are none with test_every = {config.test_every}")
     qualities = evaluate(scene, capture, capture.test, config)
-    for name, quality in qualities.items():
-        print(f"{name}: PSNR {quality.psnr:.2f} dB, SSIM {quality.ssim:.4f}")
-    print_mean(qualities)
+    if options.json:
+        print_json(metrics_of(qualities))
+    else:
+        print_qualities(qualities)
     if options.out is not None:
         write_json(options.out, metrics_of(qualities))

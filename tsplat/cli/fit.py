@@ -3,20 +3,29 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
+import sys
 from pathlib import Path
 
 from tsplat.cli.common import add_device, add_fields, config_of, device_of, print_mean
-from tsplat.fit import FitConfig, fit
+from tsplat.fit import fit
 from tsplat.scene import write_synthetic_capture
 
 HELP = "fit a scene to photos"
+USAGE = "tsplat fit DATA -o OUT [options]"
+DESCRIPTION = """
+Fit Gaussians, or spheres, to posed photos. Writes scene.ply, metrics.json,
+config.json, curves.png, test/*.png (held-out photo beside render), contact.png
+and checkpoint.pt, from which the same command goes on after an interruption.
+"""
+EXAMPLES = """
+  tsplat fit --synthetic -o out
+  tsplat fit capture -o out --downscale 4 --steps 7000 --max-splats 200000
+  tsplat fit capture -o again --config out/config.json
+"""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    parser.description = ("Fit Gaussians, or spheres, to posed photos. Writes scene.ply, metrics.json, config.json, curves.png, test/*.png (held-out "
-                          "photo beside render), contact.png and checkpoint.pt, from which the same command goes on after an interruption.")
     data = parser.add_mutually_exclusive_group(required=True)
     data.add_argument("data", nargs="?", metavar="DATA", help="folder of a COLMAP model with photos, or of a transforms.json")
     data.add_argument("--synthetic", action="store_true",
@@ -24,9 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT", help="folder to write to, made if need be")
     parser.add_argument("--config", type=Path, metavar="FILE", help="a config.json, for what is not given here: makes the same scene again")
     parser.add_argument("--fresh", action="store_true", help="start anew instead of going on from OUT/checkpoint.pt")
-    parser.add_argument("--quiet", action="store_true", help="no progress line")
+    parser.add_argument("--quiet", action="store_true", help="no progress line, which is on terminals only anyway")
     add_device(parser)
-    add_fields(parser, [item.name for item in dataclasses.fields(FitConfig)])
+    add_fields(parser)
 
 
 def run(options: argparse.Namespace) -> None:
@@ -38,7 +47,8 @@ def run(options: argparse.Namespace) -> None:
         if not (data / "sparse" / "0" / "points3D.txt").exists():              # the file that is written last
             print(f"rendering a small capture of a made-up scene to {data}")
             write_synthetic_capture(data)
-    result = fit(data, config, options.out, resume=not options.fresh, progress=not options.quiet, device=device_of(options.device))
+    result = fit(data, config, options.out, resume=not options.fresh, progress=sys.stderr.isatty() and not options.quiet,
+                 device=device_of(options.device))
     print_mean(result.qualities)
     if result.refined_mean is not None:
         print(f"with their poses refined, too: PSNR {result.refined_mean.psnr:.2f} dB, SSIM {result.refined_mean.ssim:.4f}")

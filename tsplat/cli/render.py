@@ -3,97 +3,134 @@
 from __future__ import annotations
 
 import argparse
-import math
+from collections.abc import Iterator
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from tsplat.camera import Camera
-from tsplat.cli.common import SCENE, add_device, device_of, quantiles
-from tsplat.fit import draw
-from tsplat.scene import Spheres, load_capture, load_scene, write_image
+from tsplat.cli.common import SCENE, add_device, device_of
+from tsplat.pictures import CLIPS, FPS, MODES, capture_path, check_clip, depth_range, draw_layers, orbit, picture, write_clip
+from tsplat.pictures.modes import Scene
+from tsplat.scene import load_capture, load_scene, write_image
 
-HELP = "render a scene to PNG"
+HELP = "render a scene to pictures or a clip"
+USAGE = "tsplat render SCENE -o OUT [options]"
+DESCRIPTION = """
+Render a scene as PNG, or as an animated GIF or an MP4 if the name of OUT ends
+in .gif or .mp4. An MP4 has even sizes: an odd last column or row is left out.
+"""
+EXAMPLES = """
+  tsplat render scene.ply -o view.png --camera capture --index 3     as photo 3 shows it
+  tsplat render scene.ply -o view.png --orbit 12                     view_000.png to view_011.png
+  tsplat render scene.ply -o turn.gif --orbit 60 --mode normals      a clip
+  tsplat render scene.ply -o fly.mp4 --path capture --frames 240     needs pip install 'tsplat[video]'
+"""
 AXES = {sign + axis: tuple(float(f"{sign}1") * (axis == a) for a in "xyz") for sign in ("", "-") for axis in "xyz"}
 SIZE = (800, 600)
-ELEVATION = 20.0                     # degrees above the horizon, for cameras that frame the scene
-FRAMED = 0.95                        # part of the splats to be in the picture; the others may be far away
+FRAMES = 120
+BACKGROUNDS = {"black": 0.0, "white": 1.0, "transparent": None}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("scene", metavar="SCENE", help=SCENE)
-    parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT.png", help="picture to write; its folder is made")
-    view = parser.add_mutually_exclusive_group()
+    parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT",
+                        help="the picture, or several: OUT_000.png, OUT_001.png, ...; or a clip. Its folder is made")
+    views = parser.add_argument_group("where from", "By default, from in front of the scene.")
+    view = views.add_mutually_exclusive_group()
     view.add_argument("--camera", metavar="DATA", help="take a camera of this capture (folder or transforms.json)")
-    view.add_argument("--orbit", type=int, metavar="N", help="N pictures from around the scene: OUT_000.png, OUT_001.png, ...")
-    parser.add_argument("--index", type=int, default=0, metavar="I", help="which photo's camera, in the order of their names (default: 0)")
-    parser.add_argument("--size", type=_size, metavar="WxH", help=f"of the picture (default: the camera's, or {SIZE[0]}x{SIZE[1]})")
-    parser.add_argument("--fov", type=float, default=50.0, metavar="DEGREES", help="horizontal, without --camera (default: 50)")
-    parser.add_argument("--up", choices=AXES, default="-y", help="which way is up in the scene, without --camera (default: --up=-y)")
-    parser.add_argument("--background", choices=("black", "white"), default="black", help="(default: black)")
-    parser.add_argument("--antialiased", action="store_true", help="for scenes that were fitted with it")
+    view.add_argument("--orbit", type=int, metavar="N", help="N pictures from around the scene")
+    view.add_argument("--path", metavar="DATA", help="along a smooth path through the training cameras of this capture")
+    views.add_argument("--index", type=int, metavar="I", help="with --camera: which photo's, in the order of their names (default: 0)")
+    views.add_argument("--frames", type=int, metavar="N", help=f"with --path: how many pictures (default: {FRAMES})")
+    views.add_argument("--closed", action="store_true", help="with --path: end where it began")
+    views.add_argument("--size", type=_size, metavar="WxH", help=f"of the picture (default: the camera's, or {SIZE[0]}x{SIZE[1]})")
+    views.add_argument("--fov", type=float, default=50.0, metavar="DEGREES", help="horizontal, without a capture (default: 50)")
+    views.add_argument("--up", choices=AXES, default="-y", help="which way is up in the scene, without a capture (default: --up=-y)")
+    what = parser.add_argument_group("what of")
+    what.add_argument("--mode", choices=MODES, default="color",
+                      help="depth: along the camera's axis, near is yellow and far dark violet (viridis). normals: of the surface that the depth "
+                           "shows (not of single splats), in the camera's axes: red to the right, green up, blue towards the camera (default: color)")
+    what.add_argument("--depth-range", type=float, nargs=2, metavar=("NEAR", "FAR"),
+                      help="depths of the ends of the colour map (default: so that 98%% of all that is seen in all pictures is between them)")
+    what.add_argument("--background", choices=BACKGROUNDS, default="black", help="transparent: PNG only (default: black)")
+    what.add_argument("--antialiased", action="store_true", help="for scenes that were fitted with it")
+    parser.add_argument("--fps", type=float, help=f"frames per second of a clip (default: {FPS:g})")
     add_device(parser)
 
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
-    device = device_of(options.device)
-    scene = load_scene(options.scene)
-    if options.camera is not None:
-        cameras = [_capture_camera(options.camera, options.index, options.size)]
-    else:
-        centres = scene.positions if isinstance(scene, Spheres) else scene.means
-        cameras = _framing_cameras(centres, 1 if options.orbit is None else options.orbit, AXES[options.up],
-                                   options.size or SIZE, options.fov)
-    out: Path = options.out
+    device, out, clip = device_of(options.device), options.out, options.out.suffix.lower() in CLIPS
+    _check(options, clip)
+    if clip:
+        check_clip(out)
+    elif out.suffix.lower() != ".png":
+        raise ValueError(f"{out}: expected a file name that ends in .png, {' or '.join(CLIPS)}; got {out.suffix!r}")
+    scene = load_scene(options.scene).to(device)
+    cameras = [camera.to(device) for camera in _cameras(options, scene)]
     out.parent.mkdir(parents=True, exist_ok=True)
-    background = torch.full((3,), float(options.background == "white"), device=device)
-    scene.to(device)
-    for i, camera in enumerate(cameras):
-        with torch.no_grad():
-            if isinstance(scene, Spheres):
-                image = scene.render(camera.to(device), background=background).image
-            else:
-                image = draw(scene, camera.to(device), background, antialiased=options.antialiased).image
-        path = out if options.orbit is None else out.with_name(f"{out.stem}_{i:03d}{out.suffix}")
+    pictures = _pictures(options, scene, cameras)
+    if clip:
+        from tqdm import tqdm
+
+        write_clip(out, tqdm(pictures, total=len(cameras), unit="frame", leave=False, disable=None), options.fps or FPS)
+        print(out)
+        return
+    for i, image in enumerate(pictures):
+        path = out if options.orbit is None and options.path is None else out.with_name(f"{out.stem}_{i:03d}{out.suffix}")
         write_image(path, image)
         print(path)
 
 
-def _capture_camera(data: str, index: int, size: tuple[int, int] | None) -> Camera:
-    capture = load_capture(data, test_every=0)
-    if not 0 <= index < len(capture):
-        raise ValueError(f"--index: expected 0 to {len(capture) - 1}, as {data} has {len(capture)} photos; got {index}")
-    camera = capture.camera(index)
-    return camera if size is None else camera.resized(*size)
+def _check(options: argparse.Namespace, clip: bool) -> None:
+    """Options that are out of range, or would be ignored, are errors."""
+    for name, value, good, expected in (
+        ("--orbit", options.orbit, options.orbit is None or options.orbit >= 1, "at least 1"),
+        ("--frames", options.frames, options.frames is None or options.frames >= 1, "at least 1"),
+        ("--fov", options.fov, 0 < options.fov < 180, "degrees above 0 and below 180"),
+    ):
+        if not good:
+            raise ValueError(f"{name}: expected {expected}; got {value}")
+    for name, given, useful, where in (
+        ("--index", options.index is not None, options.camera is not None, "--camera"),
+        ("--frames", options.frames is not None, options.path is not None, "--path"),
+        ("--closed", options.closed, options.path is not None, "--path"),
+        ("--fps", options.fps is not None, clip, "a clip"),
+        ("--depth-range", options.depth_range is not None, options.mode == "depth", "--mode depth"),
+        ("--background transparent", options.background == "transparent", not clip, "PNG"),
+    ):
+        if given and not useful:
+            raise ValueError(f"{name}: expected only with {where}")
 
 
-def _framing_cameras(means: Tensor, count: int, up: tuple[float, ...], size: tuple[int, int], fov: float) -> list[Camera]:
-    """Cameras on a circle around the middle of the splats, so far off that most of them are in the picture."""
-    if count < 1:
-        raise ValueError(f"--orbit: expected at least 1; got {count}")
-    if not 0 < fov < 180:
-        raise ValueError(f"--fov: expected degrees above 0 and below 180; got {fov}")
-    means = means.detach()[means.isfinite().all(1)]
-    centre, radius = torch.zeros(3), 1.0
-    if len(means):
-        centre = torch.tensor([sum(quantiles(axis, [1 - FRAMED, FRAMED])) / 2 for axis in means.unbind(1)])
-        radius = quantiles((means - centre).norm(dim=1), [FRAMED])[0] or 1.0
-    slope = math.tan(math.radians(fov) / 2) * min(1.0, size[1] / size[0])
-    distance = radius / math.sin(math.atan(slope))
-    axis = torch.tensor(up)
-    back = -axis.abs().roll(1)                                     # from where the first camera looks: -z if y is vertical
-    side = torch.linalg.cross(axis, back)
-    elevation = math.radians(ELEVATION)
-    cameras = []
-    for i in range(count):
-        angle = 2 * math.pi * i / count
-        level = math.cos(angle) * back + math.sin(angle) * side
-        eye = centre + distance * (math.cos(elevation) * level + math.sin(elevation) * axis)
-        cameras.append(Camera.look_at(eye, centre, up, width=size[0], height=size[1], fov=fov))
-    return cameras
+def _cameras(options: argparse.Namespace, scene: Scene) -> list[Camera]:
+    size = options.size
+    if options.camera is None and options.path is None:
+        width, height = size or SIZE
+        return orbit(scene, options.orbit or 1, width=width, height=height, fov=options.fov, up=AXES[options.up])
+    if options.camera is not None:
+        capture, index = load_capture(options.camera, test_every=0), options.index or 0
+        if not 0 <= index < len(capture):
+            raise ValueError(f"--index: expected 0 to {len(capture) - 1}, as {options.camera} has {len(capture)} photos; got {index}")
+        cameras = [capture.camera(index)]
+    else:
+        cameras = capture_path(load_capture(options.path, test_every=0), options.frames or FRAMES, closed=options.closed)
+    return cameras if size is None else [camera.resized(*size) for camera in cameras]
+
+
+def _pictures(options: argparse.Namespace, scene: Scene, cameras: list[Camera]) -> Iterator[Tensor]:
+    mode, antialiased = options.mode, options.antialiased
+    shade = BACKGROUNDS[options.background]
+    background = None if shade is None else torch.full((3,), shade, device=scene.device)
+    ends = options.depth_range
+    if mode == "depth" and ends is None:
+        ends = depth_range(scene, cameras, antialiased=antialiased)
+    for camera in cameras:
+        layers = draw_layers(scene, camera, depth=mode in ("depth", "normals"), antialiased=antialiased)
+        yield picture(layers, camera, mode, background=background, depth_range=ends)
 
 
 def _size(text: str) -> tuple[int, int]:

@@ -13,12 +13,14 @@ Background = Literal["black", "white", "random"]
 Density = Literal["budget", "adaptive", "mcmc", "none"]
 Primitive = Literal["gaussians", "spheres"]
 Optimiser = Literal["adam", "visible"]
+BASICS, PHOTOS, START, DENSITY, LOSS, CAMERAS, SPHERES, RATES, OUTPUT = (
+    "basics", "photos", "start and course", "density control", "loss", "exposure and poses", "spheres", "optimiser", "output")
 CHOICES = {"Background": Background, "Density": Density, "Primitive": Primitive, "Optimiser": Optimiser}
 
 
-def _about(text: str, low: float = -math.inf, high: float = math.inf, *, decides: bool = True) -> dict[str, Any]:
-    """Metadata of a field: its help text, its range, and whether it can change the result."""
-    return {"help": text, "low": low, "high": high, "decides": decides}
+def _about(topic: str, text: str, low: float = -math.inf, high: float = math.inf, *, decides: bool = True) -> dict[str, Any]:
+    """Metadata of a field: under which heading its help is, that text, its range, and whether it can change the result."""
+    return {"topic": topic, "help": text, "low": low, "high": high, "decides": decides}
 
 
 @dataclass(frozen=True)
@@ -33,66 +35,67 @@ class FitConfig:
         ValueError, TypeError: naming the field, what came and what is expected.
     """
 
-    primitive: Primitive = field(default="gaussians", metadata=_about("what the scene is made of"))
-    steps: int = field(default=1000, metadata=_about("optimisation steps, one photo each", 0))
-    downscale: float = field(default=1.0, metadata=_about("divide the size of the photos by this", 1))
-    test_every: int = field(default=8, metadata=_about(
+    primitive: Primitive = field(default="gaussians", metadata=_about(BASICS, "what the scene is made of"))
+    steps: int = field(default=1000, metadata=_about(BASICS, "optimisation steps, one photo each", 0))
+    downscale: float = field(default=1.0, metadata=_about(PHOTOS, "divide the size of the photos by this", 1))
+    test_every: int = field(default=8, metadata=_about(PHOTOS,
         "hold out every n-th photo, in the order of their names, for the evaluation; 0: none", 0))
-    splats: int = field(default=30_000, metadata=_about(
+    splats: int = field(default=30_000, metadata=_about(BASICS,
         "splats to start with at least; where there are fewer points, more are put around them", 0))
-    max_splats: int = field(default=0, metadata=_about(
+    max_splats: int = field(default=0, metadata=_about(BASICS,
         "never more splats than this; 0: with the density control `budget` as many as it starts with, with others 1,000,000", 0))
-    density: Density = field(default="budget", metadata=_about(
+    density: Density = field(default="budget", metadata=_about(DENSITY,
         "density control; budget: exactly max_splats in the end, by score; adaptive: clone, split, prune and reset as in 3DGS; "
         "mcmc: relocation and noise; none"))
-    density_start: float = field(default=1 / 60, metadata=_about("part of the steps before density control", 0, 1))
-    density_stop: float = field(default=0.5, metadata=_about("part of the steps after which it ends", 0, 1))
-    density_every: int = field(default=100, metadata=_about("steps between its actions; a twentieth of the steps at most", 1))
-    density_absgrad: bool = field(default=False, metadata=_about(
+    density_start: float = field(default=1 / 60, metadata=_about(DENSITY, "part of the steps before density control", 0, 1))
+    density_stop: float = field(default=0.5, metadata=_about(DENSITY, "part of the steps after which it ends", 0, 1))
+    density_every: int = field(default=100, metadata=_about(DENSITY, "steps between its actions; a twentieth of the steps at most", 1))
+    density_absgrad: bool = field(default=False, metadata=_about(DENSITY,
         "adaptive: judge by gradients without regard to sign (budget always does)"))
-    density_threshold: float | None = field(default=None, metadata=_about(
+    density_threshold: float | None = field(default=None, metadata=_about(DENSITY,
         "adaptive: screen-space gradient (NDC) from which splats are cloned or split; default 2e-4, and 8e-4 with absgrad", 0))
-    reset_every: int = field(default=3000, metadata=_about(
+    reset_every: int = field(default=3000, metadata=_about(DENSITY,
         "adaptive: steps between resets of the opacities in a fit of 30,000, in proportion in others; 0: never", 0))
-    sh_degree: int = field(default=3, metadata=_about("degree of the spherical harmonics of the colours", 0, MAX_SH_DEGREE))
-    sh_warmup: float = field(default=0.1, metadata=_about("part of the steps in which the degree rises to that", 0, 1))
-    resolution_warmup: float = field(default=0.0, metadata=_about(
+    sh_degree: int = field(default=3, metadata=_about(START, "degree of the spherical harmonics of the colours", 0, MAX_SH_DEGREE))
+    sh_warmup: float = field(default=0.1, metadata=_about(START, "part of the steps in which the degree rises to that", 0, 1))
+    resolution_warmup: float = field(default=0.0, metadata=_about(START,
         "part of the steps in which photos are at 1/4 and then, as long, at 1/2 of their size", 0, 1))
-    init_opacity: float | None = field(default=None, metadata=_about("opacity of the first splats; default 0.1, with mcmc 0.5", 1e-6, 1 - 1e-6))
-    init_scale: float | None = field(default=None, metadata=_about(
+    init_opacity: float | None = field(default=None, metadata=_about(START,
+        "opacity of the first splats; default 0.1, with mcmc 0.5", 1e-6, 1 - 1e-6))
+    init_scale: float | None = field(default=None, metadata=_about(START,
         "size of the first splats, in distances to their neighbours; default 1, with mcmc 0.1", 1e-6))
-    antialiased: bool = field(default=False, metadata=_about("compensate the opacity of splats smaller than a pixel"))
-    background: Background = field(default="black", metadata=_about(
+    antialiased: bool = field(default=False, metadata=_about(BASICS, "compensate the opacity of splats smaller than a pixel"))
+    background: Background = field(default="black", metadata=_about(BASICS,
         "what lies behind the splats and behind photos with alpha; random: new at each step, white in the evaluation"))
-    ssim_weight: float = field(default=0.2, metadata=_about("loss = (1 - w) L1 + w (1 - SSIM)", 0, 1))
-    opacity_reg: float | None = field(default=None, metadata=_about("weight of the mean opacity in the loss; default 0, with mcmc 0.01", 0))
-    scale_reg: float | None = field(default=None, metadata=_about("weight of the mean scale in the loss; default 0, with mcmc 0.01", 0))
-    opacity_depth_reg: float = field(default=0.0, metadata=_about(
+    ssim_weight: float = field(default=0.2, metadata=_about(LOSS, "loss = (1 - w) L1 + w (1 - SSIM)", 0, 1))
+    opacity_reg: float | None = field(default=None, metadata=_about(LOSS, "weight of the mean opacity in the loss; default 0, with mcmc 0.01", 0))
+    scale_reg: float | None = field(default=None, metadata=_about(LOSS, "weight of the mean scale in the loss; default 0, with mcmc 0.01", 0))
+    opacity_depth_reg: float = field(default=0.0, metadata=_about(LOSS,
         "weight of minus the mean of opacity times depth over extent: opaque splats in front of the cameras give way (Pulsar)", 0))
-    depth_weight: float = field(default=0.0, metadata=_about("weight of the relative error of depth, where photos have depth maps", 0))
-    exposure: bool = field(default=False, metadata=_about("fit an affine change of colours to each photo"))
-    lr_exposure: float = field(default=1e-3, metadata=_about("learning rate of these", 0))
-    refine_poses: bool = field(default=False, metadata=_about(
+    depth_weight: float = field(default=0.0, metadata=_about(LOSS, "weight of the relative error of depth, where photos have depth maps", 0))
+    exposure: bool = field(default=False, metadata=_about(CAMERAS, "fit an affine change of colours to each photo"))
+    lr_exposure: float = field(default=1e-3, metadata=_about(CAMERAS, "learning rate of these", 0))
+    refine_poses: bool = field(default=False, metadata=_about(CAMERAS,
         "fit the poses of the cameras, too; those of held-out photos afterwards, to the finished scene, for a second score"))
-    lr_poses: float = field(default=1e-4, metadata=_about("first learning rate of poses: radians, and shifts per extent of the scene", 0))
-    pose_steps: int = field(default=50, metadata=_about("steps in which the pose of each held-out photo is refined", 0))
-    gamma_first: float = field(default=0.1, metadata=_about("spheres: gamma at the first step, soft", 1e-5, 1))
-    gamma_last: float = field(default=3e-3, metadata=_about("spheres: gamma at the last step, hard; log-linear in between", 1e-5, 1))
-    fade_below: float = field(default=1.0, metadata=_about(
+    lr_poses: float = field(default=1e-4, metadata=_about(CAMERAS, "first learning rate of poses: radians, and shifts per extent of the scene", 0))
+    pose_steps: int = field(default=50, metadata=_about(CAMERAS, "steps in which the pose of each held-out photo is refined", 0))
+    gamma_first: float = field(default=0.1, metadata=_about(SPHERES, "spheres: gamma at the first step, soft", 1e-5, 1))
+    gamma_last: float = field(default=3e-3, metadata=_about(SPHERES, "spheres: gamma at the last step, hard; log-linear in between", 1e-5, 1))
+    fade_below: float = field(default=1.0, metadata=_about(SPHERES,
         "spheres: their positions and radii move less if their radius is below this many pixels, where gradients are noise", 0))
-    optimiser: Optimiser = field(default="adam", metadata=_about(
+    optimiser: Optimiser = field(default="adam", metadata=_about(RATES,
         "visible: splats that a step does not see rest in it, and keep moments and bias correction of their own"))
-    lr_means: float = field(default=1.6e-4, metadata=_about("first learning rate of the means, per extent of the scene", 0))
-    lr_means_decay: float = field(default=0.01, metadata=_about(
+    lr_means: float = field(default=1.6e-4, metadata=_about(RATES, "first learning rate of the means, per extent of the scene", 0))
+    lr_means_decay: float = field(default=0.01, metadata=_about(RATES,
         "last over first learning rate of the means; log-linear in between", 1e-9, 1))
-    lr_scales: float = field(default=5e-3, metadata=_about("learning rate of the log scales", 0))
-    lr_quats: float = field(default=1e-3, metadata=_about("learning rate of the quaternions", 0))
-    lr_opacities: float = field(default=5e-2, metadata=_about("learning rate of the opacity logits", 0))
-    lr_sh0: float = field(default=2.5e-3, metadata=_about("learning rate of the constant colour coefficients", 0))
-    lr_sh_rest: float = field(default=1.25e-4, metadata=_about("learning rate of the other colour coefficients", 0))
-    seed: int = field(default=0, metadata=_about("of all that is random", 0, 2**62))
-    video: int = field(default=0, metadata=_about("frames of a turntable, OUT/turntable.gif; 0: none", 0, decides=False))
-    checkpoint_every: int = field(default=500, metadata=_about("steps between checkpoints", 1, decides=False))
+    lr_scales: float = field(default=5e-3, metadata=_about(RATES, "learning rate of the log scales", 0))
+    lr_quats: float = field(default=1e-3, metadata=_about(RATES, "learning rate of the quaternions", 0))
+    lr_opacities: float = field(default=5e-2, metadata=_about(RATES, "learning rate of the opacity logits", 0))
+    lr_sh0: float = field(default=2.5e-3, metadata=_about(RATES, "learning rate of the constant colour coefficients", 0))
+    lr_sh_rest: float = field(default=1.25e-4, metadata=_about(RATES, "learning rate of the other colour coefficients", 0))
+    seed: int = field(default=0, metadata=_about(BASICS, "of all that is random", 0, 2**62))
+    video: int = field(default=0, metadata=_about(OUTPUT, "frames of a turntable, OUT/turntable.gif; 0: none", 0, decides=False))
+    checkpoint_every: int = field(default=500, metadata=_about(OUTPUT, "steps between checkpoints", 1, decides=False))
 
     def __post_init__(self) -> None:
         for item in fields(self):

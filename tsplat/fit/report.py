@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate, pad
 
+from tsplat.fit.comparison import error_picture
 from tsplat.fit.plot import curves
 from tsplat.scene import read_image, write_image
 
@@ -19,7 +20,6 @@ if TYPE_CHECKING:
 
 BINS = 500               # points of a curve, at most
 SHEET_ROWS, SHEET_SIDE = 8, 240
-ERROR_GAIN = 4.0         # of the shown error: a quarter of full scale is white
 
 
 @dataclass
@@ -53,8 +53,7 @@ def write_sheet(path: Path, pictures: Sequence[Path]) -> None:
     rows = []
     for picture in pictures[::step]:
         photo, render = (read_image(picture).float() / 255).chunk(2, dim=1)
-        error = (ERROR_GAIN * (photo - render).abs()).clamp(max=1)
-        rows.append(torch.cat([_small(image) for image in (photo, render, error)], dim=1))
+        rows.append(torch.cat([_small(image) for image in (photo, render, error_picture(photo, render))], dim=1))
     width = max(row.shape[1] for row in rows)
     write_image(path, torch.cat([pad(row, (0, 0, 0, width - row.shape[1])) for row in rows]))
 

@@ -13,6 +13,7 @@ from tsplat.checks import check_choice, check_tensor
 from tsplat.pictures.colormap import viridis
 from tsplat.pictures.normals import camera_points, normals
 from tsplat.scene import Gaussians, Spheres
+from tsplat.scene.quantiles import quantiles
 
 Scene: TypeAlias = Gaussians | Spheres
 Mode = Literal["color", "depth", "alpha", "normals"]
@@ -120,8 +121,8 @@ def depth_range(scene: Scene, cameras: Iterable[Camera], *, antialiased: bool = 
 
 
 def _range_of(views: Sequence[Layers]) -> tuple[float, float]:
-    depths = torch.cat([view.depth[view.alpha >= SOLID] for view in views if view.depth is not None]).sort().values
+    depths = torch.cat([view.depth[view.alpha >= SOLID] for view in views if view.depth is not None])
     if not len(depths):
         return 0.0, 1.0
-    near, far = (float(depths[round(q * (len(depths) - 1))]) for q in QUANTILES)
+    near, far = quantiles(depths, QUANTILES)
     return near, max(far, near * (1 + 1e-6), 1e-30)

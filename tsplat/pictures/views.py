@@ -12,6 +12,7 @@ from tsplat.camera import Camera
 from tsplat.pictures.modes import Scene
 from tsplat.pictures.spline import Poses, round_trip, spline
 from tsplat.scene import Capture, Spheres
+from tsplat.scene.quantiles import quantiles
 
 ELEVATION = 20.0                     # degrees above the horizon
 FRAMED = 0.95                        # part of the splats to be in the picture; the others may be far away
@@ -68,7 +69,7 @@ def capture_path(capture: Capture, frames: int, *, closed: bool = False) -> list
     if frames < 1:
         raise ValueError(f"frames: expected at least 1; got {frames}")
     chosen = capture.train or list(range(len(capture)))
-    count = max(2, frames // FRAMES_PER_KEY)
+    count = max(4, frames // FRAMES_PER_KEY)
     if count < len(chosen):
         chosen = [chosen[i * len(chosen) // count] for i in range(count)]
     keys = Poses.of(capture.viewmats[chosen])
@@ -84,7 +85,5 @@ def _middle(centres: Tensor) -> tuple[Tensor, float]:
     centres = centres[centres.isfinite().all(1)]
     if not len(centres):
         return torch.zeros(3), 1.0
-    ends = centres.sort(0).values[[round(q * (len(centres) - 1)) for q in (1 - FRAMED, FRAMED)]]
-    centre = ends.mean(0)
-    distances = (centres - centre).norm(dim=1).sort().values
-    return centre, float(distances[round(FRAMED * (len(distances) - 1))]) or 1.0
+    centre = torch.tensor([sum(quantiles(axis, [1 - FRAMED, FRAMED])) / 2 for axis in centres.unbind(1)])
+    return centre, quantiles((centres - centre).norm(dim=1), [FRAMED])[0] or 1.0

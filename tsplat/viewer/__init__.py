@@ -3,6 +3,6 @@
 from tsplat.viewer.loop import RenderLoop
 from tsplat.viewer.training import TrainingView
 from tsplat.viewer.view import Settings, draw_view
-from tsplat.viewer.views import Views, middle_of
+from tsplat.viewer.views import Views
 
-__all__ = ["RenderLoop", "Settings", "TrainingView", "Views", "draw_view", "middle_of"]
+__all__ = ["RenderLoop", "Settings", "TrainingView", "Views", "draw_view"]

@@ -94,7 +94,8 @@ class RenderLoop:
             begin = time.monotonic()
             try:
                 pixels = draw_view(scene, job.wish.viewpoint.camera(job.divisor), job.wish.settings)
-                job.visitor.show(Frame(pixels, job.wish, job.divisor, time.monotonic() - begin))
+                if job.visitor in self._schedule.visitors:             # still
+                    job.visitor.show(Frame(pixels, job.wish, job.divisor, time.monotonic() - begin))
             except Exception:                         # one picture that fails (memory, say) must not end those of all visitors
                 traceback.print_exc()
             with self._changed:

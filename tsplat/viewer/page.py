@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import io
 import socket
-import time
+import warnings
+from collections.abc import Iterator
 from types import TracebackType
 
 import numpy as np
@@ -15,6 +16,9 @@ try:
 except ImportError as error:
     raise ImportError(f"the viewer needs the package viser: pip install 'tsplat[viewer]' ({error})") from None
 
+from tsplat.fit import FitConfig
+from tsplat.fit.drawing import fixed_background
+from tsplat.scene import Capture
 from tsplat.viewer.controls import Controls
 from tsplat.viewer.loop import RenderLoop
 from tsplat.viewer.training import Report, TrainingView
@@ -22,7 +26,8 @@ from tsplat.viewer.view import Settings
 from tsplat.viewer.viewpoint import stance
 from tsplat.viewer.views import Views
 
-POLL_SECONDS = 0.2
+# A visitor who leaves while a picture is on its way is nothing to warn of
+warnings.filterwarnings("ignore", r"Queued a \w+ on a closed connection", UserWarning)
 
 
 class Page:
@@ -66,6 +71,11 @@ class Page:
         server.on_client_disconnect(leave)
 
     @property
+    def visited(self) -> bool:
+        """Whether anybody has it open."""
+        return self._loop.visitors > 0
+
+    @property
     def url(self) -> str:
         """Of the page, for this machine."""
         host = self._server.get_host()
@@ -92,11 +102,6 @@ class Page:
         button.on_click(toggle)
         training.tell = tell
 
-    def wait_until_left(self) -> None:
-        """Return as soon as no page is open."""
-        while self._loop.visitors:
-            time.sleep(POLL_SECONDS)
-
     def close(self) -> None:
         """End the server."""
         with contextlib.redirect_stdout(io.StringIO()):          # viser says so
@@ -107,6 +112,23 @@ class Page:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
+
+
+@contextlib.contextmanager
+def training_page(capture: Capture, config: FitConfig, *, host: str = "127.0.0.1", port: int = 8080) -> Iterator[tuple[Page, TrainingView]]:
+    """A page on which a fit can be watched, and the callback for that fit.
+
+    Args:
+        capture, config: of the fit.
+        host, port: see `Page`.
+    """
+    red, green, blue = fixed_background(config).tolist()
+    settings = Settings(background=(red, green, blue), antialiased=config.antialiased)
+    with RenderLoop() as loop, Page(loop, Views.of_capture(capture), settings, None if config.primitive == "spheres" else config.sh_degree,
+                                    host=host, port=port) as page:
+        training = TrainingView(loop, config.steps)
+        page.add_training(training)
+        yield page, training
 
 
 class _Server(viser.ViserServer):

@@ -1,7 +1,6 @@
 """The page in a real browser: what is on the screen is what the library renders."""
 
 import contextlib
-import dataclasses
 import math
 import shutil
 import threading
@@ -29,8 +28,8 @@ from tsplat.viewer.page import Page, training_page  # noqa: E402
 Wait = Callable[..., None]
 WIDTH, HEIGHT = 800, 480
 SEEN = (slice(160, HEIGHT), slice(0, 440))       # rows and columns that no control or notice of the page covers
-LEVELS = 3.0
-"""Mean difference of screen and render, in 1/255: JPEG of quality 90 (0.7 on these pictures). One splat less is more than that."""
+LEVELS = 1.2
+"""Mean difference of screen and render, in 1/255: JPEG leaves up to 0.94 on these pictures; three pixels to the side are 1.3 and more."""
 SWITCHES = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
             "--disable-component-update", "--disable-sync"]
 
@@ -188,9 +187,6 @@ def test_a_fit_is_watched_paused_and_left(browser: Any, capture: Capture, wait: 
     """And ends with the bits of one that nobody watched."""
     monkeypatch.setattr(tsplat.viewer.training, "ABSENCE", math.inf)
     config = FitConfig(steps=40, splats=200, max_splats=300, test_every=4, density="mcmc", background="random", sh_degree=1)
-    assert capture.points is not None
-    assert capture.point_colors is not None
-    capture = dataclasses.replace(capture, points=capture.points[:200], point_colors=capture.point_colors[:200])
     alone = fit(capture, config, progress=False).gaussians
     steps: list[int] = []
     closed, results = threading.Event(), list[FitResult]()

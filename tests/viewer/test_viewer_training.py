@@ -28,13 +28,6 @@ CONFIG = FitConfig(steps=60, splats=200, max_splats=300, test_every=4, density="
 WISH = Wish(Viewpoint((1.0, 0.0, 0.0, 0.0), (0.0, 0.0, -3.0), 0.8, 40, 30), Settings())
 
 
-def small(capture: Capture) -> Capture:
-    """With 200 of its points."""
-    assert capture.points is not None
-    assert capture.point_colors is not None
-    return dataclasses.replace(capture, points=capture.points[:200], point_colors=capture.point_colors[:200])
-
-
 def parameters(result: FitResult) -> list[torch.Tensor]:
     return [p.detach() for p in result.gaussians.parameters()]
 
@@ -44,7 +37,6 @@ def test_a_fit_with_a_restless_visitor_ends_with_the_same_bits(capture: Capture,
                                                                monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tsplat.viewer.training, "SNAPSHOT_SECONDS", 0.0)
     config = dataclasses.replace(CONFIG, **changes)
-    capture = small(capture)
     frames: list[Frame] = []
     with threads(count):
         torch.manual_seed(1)
@@ -65,7 +57,7 @@ def test_a_fit_with_a_restless_visitor_ends_with_the_same_bits(capture: Capture,
 
 
 def test_visitors_see_the_scene_grow_and_its_end(capture: Capture, wait: Wait) -> None:
-    capture, frames, reports = small(capture), list[Frame](), list[Report]()
+    frames, reports = list[Frame](), list[Report]()
     with RenderLoop() as loop:
         visitor = loop.enter(frames.append)
         loop.wish(visitor, WISH)
@@ -84,7 +76,7 @@ def test_nothing_is_copied_for_nobody(capture: Capture, monkeypatch: pytest.Monk
     shown = []
     with RenderLoop() as loop:
         monkeypatch.setattr(loop, "show", shown.append)
-        fit(small(capture), dataclasses.replace(CONFIG, steps=10), progress=False, callbacks=[TrainingView(loop, 10)])
+        fit(capture, dataclasses.replace(CONFIG, steps=10), progress=False, callbacks=[TrainingView(loop, 10)])
     assert len(shown) == 1                                             # the end, for those who come then
 
 
@@ -107,7 +99,7 @@ class Paused:
                 self.training.pause()
 
         def run() -> None:
-            self.result = fit(small(capture), config, progress=False, callbacks=[count, self.training])
+            self.result = fit(capture, config, progress=False, callbacks=[count, self.training])
 
         self.thread = threading.Thread(target=run)
         self.thread.start()
@@ -128,7 +120,7 @@ def test_a_paused_fit_holds_still_is_drawn_sharp_and_goes_on(capture: Capture, w
         assert paused.steps == list(range(1, CONFIG.steps + 1))
         assert not paused.reports[-1].paused
     assert paused.result is not None
-    assert_same_bits(parameters(paused.result), parameters(fit(small(capture), CONFIG, progress=False)))
+    assert_same_bits(parameters(paused.result), parameters(fit(capture, CONFIG, progress=False)))
 
 
 def test_a_paused_fit_that_nobody_sees_goes_on_and_says_so(capture: Capture, wait: Wait, monkeypatch: pytest.MonkeyPatch,
@@ -156,7 +148,7 @@ def test_ctrl_c_ends_a_pause_with_a_checkpoint(capture: Capture, tmp_path: Path)
 
         training.tell = interrupt
         with pytest.raises(KeyboardInterrupt, match="stopped after step 1 of 60; the same call goes on"):
-            fit(small(capture), CONFIG, tmp_path, progress=False, callbacks=[training])
+            fit(capture, CONFIG, tmp_path, progress=False, callbacks=[training])
     assert (tmp_path / "checkpoint.pt").exists()
-    result = fit(small(capture), CONFIG, tmp_path, progress=False)    # and it is no longer requested
-    assert_same_bits(parameters(result), parameters(fit(small(capture), CONFIG, progress=False)))
+    result = fit(capture, CONFIG, tmp_path, progress=False)    # and it is no longer requested
+    assert_same_bits(parameters(result), parameters(fit(capture, CONFIG, progress=False)))

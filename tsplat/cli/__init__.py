@@ -54,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             options.run(options)
             sys.stdout.flush()                                             # here, where it can still be caught that nobody reads it
     except KeyboardInterrupt as interrupt:
-        print(f"tsplat: {interrupt or 'interrupted'}", file=sys.stderr)
+        print(f"tsplat: {str(interrupt) or 'interrupted'}", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())     # for the flush when Python ends

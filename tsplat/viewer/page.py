@@ -144,6 +144,7 @@ def _start(host: str, port: int) -> viser.ViserServer:
     try:                                                         # viser would take the next free port, or wait for ever if there is none
         socket.create_server((host, port), family=socket.AF_INET6 if ":" in host else socket.AF_INET).close()
     except OSError as error:
-        raise OSError(f"host, port: cannot listen at {host}, port {port}: {error.strerror}") from None
+        reason = str(error.strerror).partition(" (")[0]          # not the address once more
+        raise OSError(f"host, port: cannot listen at {host}, port {port}: {reason}") from None
     with contextlib.redirect_stdout(io.StringIO()):              # viser prints a table; what we print is `url`
         return _Server(host, port, verbose=False)

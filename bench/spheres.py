@@ -257,6 +257,7 @@ def main() -> None:
 
 def measure_all(args: argparse.Namespace) -> dict[str, Any]:
     """The report, which is also written."""
+    args.out.mkdir(parents=True, exist_ok=True)
     times = args.times or (20 if args.device == "cuda" else 1 if args.large else 3)
     report = environment(args.device, args.threads)
     report["command"] = "python bench/spheres.py" + (" --quick" if args.quick else "")

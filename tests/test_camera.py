@@ -237,3 +237,14 @@ def test_look_at_takes_up_at_a_small_angle_to_the_view() -> None:
 def test_look_at_refuses_to_look_at_itself() -> None:
     with pytest.raises(ValueError, match=r"^eye, target: expected two points; got \[1\.0, 2\.0, 3\.0\] and"):
         Camera.look_at((1.0, 2.0, 3.0), (1.0, 2.0, 3.0), width=8, height=8)
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_resized_pictures_show_the_same(model: str) -> None:
+    """A point is at the same part of the width and of the height, of one camera and of a batch."""
+    one = Camera(torch.eye(4, dtype=torch.float64), f64([[20.0, 0, 11], [0, 25, 9], [0, 0, 1]]), WIDTH, HEIGHT, model=model)
+    p = points(9)[:, 0].T.double()
+    before = definition(p, one.Ks, model)[0] / f64([WIDTH, HEIGHT])
+    for small in (one.resized(12, 51), Camera(one.viewmats[None], one.Ks[None], WIDTH, HEIGHT, model=model).resized(12, 51)[0]):
+        assert (small.width, small.height, small.model) == (12, 51, model)
+        assert_close(definition(p, small.Ks, model)[0] / f64([12, 51]), before, 1e-13)

@@ -1,4 +1,4 @@
-"""Draws `playbot.png`: a trained scene and its depth, side by side.
+"""Draws `playbot.png`: a trained scene, its depth and its normals, side by side.
 
     python bench/pictures/make.py playbot_lod3_31k.ply bench/pictures/playbot.png
 
@@ -13,20 +13,15 @@ from pathlib import Path
 import torch
 
 import tsplat
+from tsplat.pictures import draw_layers, picture
 from tsplat.scene import write_image
 
 
 def main(scene: Path, out: Path) -> None:
     gaussians = tsplat.Gaussians.load(scene)
-    camera = tsplat.Camera.look_at((1.1, -1.1, -2.7), (0.0, -0.42, 0.0), width=520, height=440, fov=47)
-    with torch.no_grad():
-        rendering = tsplat.rasterize(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh, camera,
-                                     sh_degree=gaussians.sh_degree, background=torch.ones(3), depth="expected")
-    assert rendering.depth is not None
-    solid = rendering.alpha > 0.5
-    near, far = rendering.depth[solid].aminmax()
-    shade = torch.where(solid, 1 - 0.85 * (rendering.depth - near) / (far - near), 1.0)
-    write_image(out, torch.cat([rendering.image.clamp(0, 1), shade.clamp(0, 1)[..., None].expand(-1, -1, 3)], 1))
+    camera = tsplat.Camera.look_at((1.1, -1.1, -2.7), (0.0, -0.42, 0.0), width=400, height=340, fov=47)
+    layers = draw_layers(gaussians, camera)
+    write_image(out, torch.cat([picture(layers, camera, mode, background=torch.ones(3)) for mode in ("color", "depth", "normals")], 1))
 
 
 if __name__ == "__main__":

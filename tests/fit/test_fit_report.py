@@ -1,80 +1,17 @@
 """What a fit leaves behind: curves, the sheet of held-out photos, the turntable, numbers for TensorBoard."""
 
-import struct
 from collections.abc import Callable
 from pathlib import Path
 
-import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from tsplat.fit import FitConfig, fit, to_writer
 from tsplat.fit.plot import HEIGHT, WIDTH, curves
 from tsplat.fit.report import History, write_sheet
 from tsplat.fit.turntable import turntable
-from tsplat.pictures.gif import LEVELS, _lzw, write_gif
 from tsplat.scene import Capture, read_image, write_image
 
 Make = Callable[..., FitConfig]
-
-
-def unlzw(data: bytes) -> list[int]:
-    """GIF's LZW with 8-bit symbols, as a reader does it."""
-    bits, width, out, position = int.from_bytes(data, "little"), 9, [], 0
-    table: list[list[int]] = []
-    previous: list[int] = []
-    while True:
-        code = bits >> position & (1 << width) - 1
-        position += width
-        if code == 257:
-            return out
-        if code == 256:
-            table, width, previous = [[i] for i in range(256)] + [[], []], 9, []
-            continue
-        entry = table[code] if code < len(table) else [*previous, previous[0]]
-        if previous and len(table) < 4096:
-            table.append([*previous, entry[0]])
-        width = 12 if len(table) >= 2048 else max(9, len(table).bit_length())
-        out += entry
-        previous = entry
-
-
-@settings(max_examples=20, deadline=None)
-@given(n=st.integers(1, 20_000), colors=st.integers(1, 252), seed=st.integers(0, 99))
-def test_lzw_is_read_back(n: int, colors: int, seed: int) -> None:
-    """From a few pixels to more than a table of codes holds."""
-    pixels = torch.randint(0, colors, (n,), generator=torch.Generator().manual_seed(seed)).to(torch.uint8).numpy()
-    assert unlzw(_lzw(pixels)) == pixels.tolist()
-
-
-def test_gif(tmp_path: Path) -> None:
-    frames = [torch.full((6, 10, 3), level) for level in (0.0, 1.0)]
-    write_gif(tmp_path / "a.gif", frames, fps=25)
-    data = (tmp_path / "a.gif").read_bytes()
-    assert data[:6] == b"GIF89a"
-    assert struct.unpack("<HH", data[6:10]) == (10, 6)
-    assert data.endswith(b"\x00\x3B")
-    assert data.count(b"\x21\xF9\x04") == 2                          # frames
-    assert data[data.index(b"\x21\xF9\x04") + 4] == 4                # hundredths of a second
-    palette = data[13:13 + 768]
-    first = data.index(b"\x2C\x00\x00\x00\x00")
-    size = data[first + 11]
-    assert unlzw(data[first + 12:first + 12 + size]) == [0] * 60
-    assert palette[:3] == b"\x00\x00\x00"
-    assert palette[3 * 251:3 * 252] == b"\xff\xff\xff"
-    assert LEVELS[0] * LEVELS[1] * LEVELS[2] == 252
-
-
-@pytest.mark.parametrize(("name", "frames", "message"), [
-    ("a.png", [torch.zeros(2, 2, 3)], r"a\.png: expected a file name that ends in \.gif"), ("a.gif", [], "expected at least 1 frame"),
-    ("a.gif", [torch.zeros(2, 2, 3), torch.zeros(3, 2, 3)], r"^frames: expected shape \[2, 2, 3\]; got \[3, 2, 3\]"),
-    ("a.gif", [torch.zeros(0, 2, 3)], "^frames: expected 1 to 65535 pixels a side; got 2x0"),
-])
-def test_gif_of_bad_frames(tmp_path: Path, name: str, frames: list[torch.Tensor], message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        write_gif(tmp_path / name, frames)
-    assert not list(tmp_path.iterdir())
 
 
 def test_turntable_goes_round_at_the_photos_distance(capture: Capture, config: Make, tmp_path: Path) -> None:

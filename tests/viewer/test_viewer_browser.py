@@ -2,7 +2,12 @@
 
 import contextlib
 import math
+import os
+import re
 import shutil
+import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -217,3 +222,22 @@ def test_a_fit_is_watched_paused_and_left(browser: Any, capture: Capture, wait: 
         thread.join()
     assert steps == list(range(1, 41))
     assert_same_bits([p.detach() for p in results[0].gaussians.parameters()], [p.detach() for p in alone.parameters()])
+
+
+def test_the_real_program_is_watched_and_ends_by_ctrl_c(browser: Any, capture_folder: Path, wait: Wait, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "tsplat", "fit", capture_folder, "-o", tmp_path, "--steps", "100000", "--splats", "200",
+               "--view", "--view-port", "0"]
+    with subprocess.Popen(command, env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}, text=True, stdout=subprocess.PIPE,
+                          stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        url = process.stdout.readline().split()[-1]
+        screen = Screen(browser, url, wait, tmp_path)
+        screen.until(lambda: screen.tab.get_by_text(" of 100000").count(), "the step")
+        screen.until(lambda: screen.tab.get_by_text(f"{WIDTH} x {HEIGHT}, ").count(), "a sharp picture")
+        screen.tab.get_by_role("button", name="Pause").click()
+        screen.until(lambda: screen.tab.get_by_role("button", name="Go on").count(), "the pause")
+        process.send_signal(signal.SIGINT)
+        error = process.communicate()[1]
+        screen.tab.close()
+    assert process.returncode == 130
+    assert re.fullmatch(r"tsplat: stopped after step \d+ of 100000; the same call goes on from .*checkpoint.pt\n", error)

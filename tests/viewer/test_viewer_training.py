@@ -80,6 +80,18 @@ def test_nothing_is_copied_for_nobody(capture: Capture, monkeypatch: pytest.Monk
     assert len(shown) == 1                                             # the end, for those who come then
 
 
+def test_a_fit_goes_on_without_memory_for_visitors(capture: Capture, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fails(scene: object) -> None:
+        raise RuntimeError("DefaultCPUAllocator: can't allocate memory")
+
+    monkeypatch.setattr(tsplat.viewer.training.copy, "deepcopy", fails)
+    with RenderLoop() as loop:
+        loop.wish(loop.enter(lambda frame: None), WISH)
+        training = TrainingView(loop, 3)
+        with pytest.warns(UserWarning, match="no copy of the scene to look at: DefaultCPUAllocator"):
+            training(Step(1, "a.png", 0.1, 20.0, [None] * 5))
+
+
 class Paused:
     """A fit in a thread, with a visitor, that pauses after its third step."""
 
@@ -96,7 +108,7 @@ class Paused:
         def count(step: Step) -> None:
             self.steps.append(step.number)
             if step.number == 3:
-                self.training.pause()
+                self.training.toggle()
 
         def run() -> None:
             self.result = fit(capture, config, progress=False, callbacks=[count, self.training])
@@ -139,7 +151,7 @@ def test_ctrl_c_ends_a_pause_with_a_checkpoint(capture: Capture, tmp_path: Path)
     with RenderLoop() as loop:
         loop.enter(lambda frame: None)
         training = TrainingView(loop, CONFIG.steps)
-        training.pause()
+        training.toggle()
 
         def interrupt(report: Report) -> None:
             if report.paused:

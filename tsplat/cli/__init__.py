@@ -16,49 +16,61 @@ from tsplat.cli import compare, convert, eval, fit, info, render, view
 from tsplat.cli.parser import Parser
 
 INTERRUPTED = 130                    # the exit status of a shell's command that was stopped by Ctrl-C
-UNREAD = 141                         # and of one that nobody listens to any more, as in `tsplat info scene.ply | head -1`
+UNREAD = 141                         # and of one that SIGPIPE ended: nobody reads what it writes
 COMMANDS = {"fit": fit, "eval": eval, "compare": compare, "render": render, "view": view, "convert": convert, "info": info}
-DESCRIPTION = "Fit, render, view, compare, convert and inspect scenes of splats: Gaussians and spheres."
+DESCRIPTION = "Fit, render, view, compare, convert and inspect scenes of Gaussians and spheres."
 EPILOG = f"""
 examples:
-  tsplat fit --synthetic -o out                            a first fit, without any data
-  tsplat fit capture -o out --downscale 4                  photos posed by COLMAP, or a transforms.json
-  tsplat render out/scene.ply -o turn.gif --orbit 60       also .png and .mp4; also depth and normals
-  tsplat view out/scene.ply                                in a web page
-  tsplat info out/scene.ply --json                         JSON on stdout, and nothing else
+  tsplat fit --synthetic -o out                        a first fit, without data
+  tsplat fit capture -o out --downscale 4              photos posed by COLMAP
+  tsplat render out/scene.ply -o turn.gif --orbit 60   or .png, .mp4; or depth
+  tsplat view out/scene.ply                            in a web page
+  tsplat info out/scene.ply --json                     nothing but JSON
 
 exit status:
   0    done
   2    an error, which the last line on stderr says
-  {INTERRUPTED}  stopped by Ctrl-C; `tsplat fit` leaves a checkpoint, and the same command goes on from it
-  {UNREAD}  what reads the output has ended (a pipe into `head`)
+  {INTERRUPTED}  stopped by Ctrl-C; `tsplat fit` leaves a checkpoint, from which the
+       same command goes on
+  {UNREAD}  what reads the output has ended, as in `tsplat info scene.ply | head -1`
 
 `tsplat COMMAND --help` tells all about a command.
 """
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command and return its exit status: 0, 2 for an error (one line on stderr), 130 after Ctrl-C, 141 if stdout is closed.
+    """Run a command and return its exit status: 0, 2 for an error (one line on stderr), 130 after Ctrl-C, 141 if nobody reads stdout.
 
     Args:
         argv: the arguments, default `sys.argv[1:]`.
+
+    Raises:
+        SystemExit: after `--help`, with status 0, and for a wrong command line, with 2.
     """
     for stream in (sys.stdout, sys.stderr):
-        if getattr(stream, "errors", None) == "strict":                    # names of files that the terminal has no letters for
+        if getattr(stream, "errors", None) == "strict":                    # for names of files that the terminal has no letters for
             stream.reconfigure(errors="backslashreplace")                  # type: ignore[union-attr]
-    options = _parser().parse_args(argv)
+    try:
+        try:
+            return _run(_parser().parse_args(argv))
+        finally:
+            sys.stdout.flush()                                             # now, while it can still be caught that nobody reads it
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())     # for the flush when Python ends
+        return UNREAD
+
+
+def _run(options: argparse.Namespace) -> int:
     debug = options.debug or bool(os.environ.get("TSPLAT_DEBUG"))
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_: print(f"tsplat: warning: {message}", file=sys.stderr)
             options.run(options)
-            sys.stdout.flush()                                             # here, where it can still be caught that nobody reads it
     except KeyboardInterrupt as interrupt:
         print(f"tsplat: {str(interrupt) or 'interrupted'}", file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())     # for the flush when Python ends
-        return UNREAD
+        raise
     except (ValueError, OSError, ArithmeticError, NotImplementedError, MemoryError, ImportError) as error:
         if debug:
             raise

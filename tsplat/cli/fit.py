@@ -24,7 +24,7 @@ EXAMPLES = """
   tsplat fit --synthetic -o out
   tsplat fit capture -o out --downscale 4 --steps 7000 --max-splats 200000
   tsplat fit capture -o again --config out/config.json
-  tsplat fit capture -o out --view                     in a web page, while it goes on
+  tsplat fit capture -o out --view                     watch it in a web page
 """
 VIEW_PORT = 8080
 POLL_SECONDS = 0.2
@@ -77,8 +77,14 @@ def run(options: argparse.Namespace) -> None:
 
 
 def _fit(options: argparse.Namespace, data: Capture | str | Path, config: FitConfig, *callbacks: Callable[[Step], None]) -> None:
-    result = fit(data, config, options.out, resume=not options.fresh, progress=sys.stderr.isatty() and not options.quiet, callbacks=callbacks,
-                 device=device_of(options.device))
+    try:
+        result = fit(data, config, options.out, resume=not options.fresh, progress=sys.stderr.isatty() and not options.quiet,
+                     callbacks=callbacks, device=device_of(options.device))
+    except KeyboardInterrupt as interrupt:
+        checkpoint = options.out / "checkpoint.pt"
+        if not interrupt.args and checkpoint.exists():                         # while reading photos, or in the evaluation
+            raise KeyboardInterrupt(f"interrupted; the same command goes on from {checkpoint}") from None
+        raise
     print_mean(result.qualities)
     if result.refined_mean is not None:
         print(f"with their poses refined, too: PSNR {result.refined_mean.psnr:.2f} dB, SSIM {result.refined_mean.ssim:.4f}")

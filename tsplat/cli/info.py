@@ -15,7 +15,7 @@ from tsplat.scene.quantiles import quantiles
 
 HELP = "say what is in a scene file or a folder of photos"
 USAGE = "tsplat info PATH [options]"
-DESCRIPTION = "Say what is in a scene file, or in a capture: a folder of photos and their cameras."
+DESCRIPTION = "Say what is in a scene file, or in a capture: photos and their cameras."
 EXAMPLES = """
   tsplat info scene.ply
   tsplat info capture --json

@@ -19,13 +19,14 @@ HELP = "render a scene to pictures or a clip"
 USAGE = "tsplat render SCENE -o OUT [options]"
 DESCRIPTION = """
 Render a scene as PNG, or as an animated GIF or an MP4 if the name of OUT ends
-in .gif or .mp4. An MP4 has even sizes: an odd last column or row is left out.
+in .gif or .mp4. An MP4 (which needs `pip install 'tsplat[video]'`) has even
+sizes: an odd last column or row is left out.
 """
 EXAMPLES = """
-  tsplat render scene.ply -o view.png --camera capture --index 3     as photo 3 shows it
-  tsplat render scene.ply -o view.png --orbit 12                     view_000.png to view_011.png
-  tsplat render scene.ply -o turn.gif --orbit 60 --mode normals      a clip
-  tsplat render scene.ply -o fly.mp4 --path capture --frames 240     needs pip install 'tsplat[video]'
+  tsplat render scene.ply -o view.png --camera capture --index 3
+  tsplat render scene.ply -o view.png --orbit 12
+  tsplat render scene.ply -o turn.gif --orbit 60 --mode normals
+  tsplat render scene.ply -o fly.mp4 --path capture --frames 240
 """
 AXES = {sign + axis: tuple(float(f"{sign}1") * (axis == a) for a in "xyz") for sign in ("", "-") for axis in "xyz"}
 SIZE = (800, 600)
@@ -87,9 +88,11 @@ def run(options: argparse.Namespace) -> None:
 
 def _check(options: argparse.Namespace, clip: bool) -> None:
     """Options that are out of range, or would be ignored, are errors."""
+    ends = options.depth_range
     for name, value, good, expected in (
         ("--orbit", options.orbit, options.orbit is None or options.orbit >= 1, "at least 1"),
         ("--frames", options.frames, options.frames is None or options.frames >= 1, "at least 1"),
+        ("--depth-range", ends, ends is None or 0 <= ends[0] < ends[1], "0 <= NEAR < FAR"),
         ("--fov", options.fov, 0 < options.fov < 180, "degrees above 0 and below 180"),
     ):
         if not good:
@@ -99,7 +102,7 @@ def _check(options: argparse.Namespace, clip: bool) -> None:
         ("--frames", options.frames is not None, options.path is not None, "--path"),
         ("--closed", options.closed, options.path is not None, "--path"),
         ("--fps", options.fps is not None, clip, "a clip"),
-        ("--depth-range", options.depth_range is not None, options.mode == "depth", "--mode depth"),
+        ("--depth-range", ends is not None, options.mode == "depth", "--mode depth"),
         ("--background transparent", options.background == "transparent", not clip, "PNG"),
     ):
         if given and not useful:

@@ -15,12 +15,12 @@ USAGE = "tsplat view SCENE [options]"
 DESCRIPTION = """
 Serve a web page that shows a scene as tsplat renders it, for any number of
 visitors, until Ctrl-C. Only this machine can open it, unless --host says more.
-Needs pip install 'tsplat[viewer]'.
+It needs pip install 'tsplat[viewer]'.
 """
 EXAMPLES = """
   tsplat view scene.ply
-  tsplat view out/scene.ply --data capture            from where its photos were taken
-  tsplat view scene.ply --host 0.0.0.0 --port 80      for everybody who can reach this machine
+  tsplat view out/scene.ply --data capture            its photos' cameras, too
+  tsplat view scene.ply --host 0.0.0.0                for all who reach you
   tsplat view scene.ply --device cuda
 """
 BACKGROUNDS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}

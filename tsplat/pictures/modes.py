@@ -50,7 +50,7 @@ def draw_layers(scene: Scene, camera: Camera, *, depth: bool = True, antialiased
     """
     if camera.batched:
         raise ValueError(f"camera: expected one camera; got a batch of {len(camera)}")
-    background = torch.zeros(3, device=scene.device)
+    background = scene.opacity_logits.new_zeros(3)
     if not isinstance(scene, Spheres):
         rendering = scene.render(camera, background=background, depth="expected" if depth else None, antialiased=antialiased)
         return Layers(rendering.image, rendering.alpha, rendering.depth)

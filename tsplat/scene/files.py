@@ -12,13 +12,16 @@ from pathlib import Path
 def replacing(path: str | os.PathLike[str]) -> Iterator[Path]:
     """Yield a temporary path beside `path`, of the same suffix; it takes `path`'s place when the block ends.
 
-    Where the block raises (a full disk, an interrupt), the temporary file is removed and `path` stays as it was.
+    Where the block raises (a full disk, an interrupt), the temporary file is removed and `path` stays as it was. An OSError about the
+    temporary file is one about `path`.
     """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}{path.suffix}")
     try:
         yield temporary
         os.replace(temporary, path)
-    except BaseException:
+    except BaseException as error:
         temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError) and error.filename in (temporary, str(temporary)):
+            error.filename = str(path)                           # the name that the user knows
         raise

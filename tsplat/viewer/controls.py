@@ -29,7 +29,7 @@ NARROWEST, WIDEST = 5.0, 120.0
 class Controls:
     """The controls of one open page, and its picture.
 
-    All callbacks are coroutines, which viser runs one after the other.
+    Callbacks are coroutines, as viser runs these one after the other, but for the one that takes long.
 
     Args:
         client: the page.
@@ -47,7 +47,7 @@ class Controls:
         with client.gui.add_folder("Camera"):
             self._add_camera(client.gui)
         self._visitor = loop.enter(self._show)
-        client.camera.on_update(self._look)
+        client.camera.on_update(self.look)
 
     def close(self) -> None:
         """The page was closed."""
@@ -72,7 +72,8 @@ class Controls:
         gui.add_button("Save picture", icon=viser.Icon.DOWNLOAD).on_click(self._save)
 
     def _add_camera(self, gui: viser.GuiApi) -> None:
-        self._fov = gui.add_slider("Field of view", min=NARROWEST, max=WIDEST, step=0.5, initial_value=50.0, hint="Vertical, in degrees")
+        self._fov = gui.add_slider("Field of view", min=NARROWEST, max=WIDEST, step=0.5, initial_value=_degrees(self._client.camera.fov),
+                                   hint="Vertical, in degrees")
         self._fov.on_update(self._zoom)
         names = list(self._views.photos)
         if names:
@@ -86,15 +87,14 @@ class Controls:
         self._settings = Settings(self._mode.value, self._size.value, None if self._degree is None else self._degree.value,
                                   (background[0] / 255, background[1] / 255, background[2] / 255),
                                   self._antialiased is not None and self._antialiased.value)
-        await self._look(self._client.camera)
+        await self.look(self._client.camera)
 
-    async def _look(self, camera: viser.CameraHandle) -> None:
+    async def look(self, camera: viser.CameraHandle) -> None:
         """Ask for the picture of the page's camera."""
-        self._fov.value = min(max(math.degrees(camera.fov), NARROWEST), WIDEST)      # type: ignore[misc]  # viser: it can be assigned
         self._loop.wish(self._visitor, Wish(_viewpoint(camera), self._settings))
 
     async def _zoom(self, event: viser.GuiEvent[Any]) -> None:
-        if event.client is not None:                      # else it was `_look`
+        if event.client is not None:                      # else it was `_go`
             self._client.camera.fov = math.radians(self._fov.value)
 
     async def _go_to_photo(self, _: Any) -> None:
@@ -116,6 +116,7 @@ class Controls:
         with self._client.atomic():
             place.position, place.look_at, place.up_direction = map(np.array, there[:3])
             place.fov = there.fov
+            self._fov.value = _degrees(there.fov)         # type: ignore[misc]  # viser: it can be assigned
 
     def _show(self, frame: Frame) -> None:
         self._client.scene.set_background_image(frame.pixels, format="jpeg", jpeg_quality=JPEG_QUALITY)
@@ -125,7 +126,7 @@ class Controls:
         self._status.content = f"{size}, {1000 * frame.seconds:.0f} ms ({1 / frame.seconds:.0f} per second)"
 
     def _save(self, _: Any) -> None:
-        """In a thread of its own, as drawing takes long."""
+        """Draw anew, without the losses of JPEG, in a thread of viser's."""
         wish = self._visitor.wish
         pixels = None if wish is None else self._loop.sharp(wish)
         if pixels is not None:
@@ -144,6 +145,11 @@ def png(pixels: Pixels) -> bytes:
         path = Path(folder) / "picture.png"
         write_image(path, torch.from_numpy(pixels).float() / 255)
         return path.read_bytes()
+
+
+def _degrees(fov: float) -> float:
+    """As the slider can show them."""
+    return min(max(math.degrees(fov), NARROWEST), WIDEST)
 
 
 def _bytes(color: tuple[float, float, float]) -> tuple[int, int, int]:

@@ -43,7 +43,7 @@ class RenderLoop:
     def wish(self, visitor: Visitor, wish: Wish) -> None:
         """A visitor wants to see this from now on."""
         with self._changed:
-            self._schedule.wish(visitor, wish, time.monotonic())
+            self._schedule.wish(visitor, wish, time.perf_counter())
             self._changed.notify_all()
 
     def show(self, scene: Scene) -> None:
@@ -69,7 +69,7 @@ class RenderLoop:
     def settled(self) -> bool:
         """Whether all visitors who do not move see a sharp picture of the scene."""
         with self._changed:
-            return self._scene is None or self._schedule.settled(time.monotonic())
+            return self._scene is None or self._schedule.settled(time.perf_counter())
 
     def sharp(self, wish: Wish) -> Pixels | None:
         """The picture of a wish at its full resolution, drawn by the calling thread; None as long as there is no scene."""
@@ -91,22 +91,22 @@ class RenderLoop:
     def _run(self) -> None:
         while (work := self._next()) is not None:
             job, scene = work
-            begin = time.monotonic()
+            begin = time.perf_counter()
             try:
                 pixels = draw_view(scene, job.wish.viewpoint.camera(job.divisor), job.wish.settings)
                 if job.visitor in self._schedule.visitors:             # still
-                    job.visitor.show(Frame(pixels, job.wish, job.divisor, time.monotonic() - begin))
+                    job.visitor.show(Frame(pixels, job.wish, job.divisor, time.perf_counter() - begin))
             except Exception:                         # one picture that fails (memory, say) must not end those of all visitors
                 traceback.print_exc()
             with self._changed:
-                now = time.monotonic()
+                now = time.perf_counter()
                 self._schedule.done(job, now - begin, now)
 
     def _next(self) -> tuple[Job, Scene] | None:
         """What to draw, as soon as there is something; None at the end."""
         with self._changed:
             while not self._closed:
-                job = None if self._scene is None else self._schedule.next(time.monotonic())
+                job = None if self._scene is None else self._schedule.next(time.perf_counter())
                 if isinstance(job, Job) and self._scene is not None:
                     return job, self._scene
                 self._changed.wait(None if isinstance(job, Job) else job)

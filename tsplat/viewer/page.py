@@ -62,7 +62,9 @@ class Page:
         camera.fov = start.fov
 
         async def enter(client: viser.ClientHandle) -> None:
-            self._visitors[client.client_id] = Controls(client, loop, views, settings or Settings(), sh_degree)
+            controls = Controls(client, loop, views, settings or Settings(), sh_degree)
+            self._visitors[client.client_id] = controls
+            await controls.look(client.camera)
 
         async def leave(client: viser.ClientHandle) -> None:
             self._visitors.pop(client.client_id).close()

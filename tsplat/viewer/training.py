@@ -6,6 +6,7 @@ import copy
 import sys
 import threading
 import time
+import warnings
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -38,8 +39,8 @@ class TrainingView:
     """A callback of `tsplat.fit.fit` that shows the scene as it grows.
 
     What is drawn are copies of the scene, made between two steps and only if somebody looks: the fit ends with the same bits with and
-    without visitors. A paused fit holds still in the callback. It goes on if it is resumed, on Ctrl-C (to save and stop), or if no page has
-    been open for 5 seconds: a fit that nobody looks at must not stand still unnoticed.
+    without visitors. Spheres are drawn with the gamma of the end. A paused fit holds still in the callback. It goes on if it is told to, on
+    Ctrl-C (to save and stop), or if no page has been open for 5 seconds: a fit that nobody looks at must not stand still unnoticed.
 
     Args:
         loop: which draws.
@@ -50,24 +51,17 @@ class TrainingView:
         self.tell: Callable[[Report], None] = lambda report: None
         """Is told how it is getting on, a few times per second."""
         self._loop, self._steps = loop, steps
-        self._paused = threading.Event()
-        self._resumed = threading.Event()
+        self._going = threading.Event()
+        self._going.set()
         self._next_snapshot = self._next_report = 0.0
         loop.take(SHARE)
 
-    def pause(self) -> None:
-        """Hold still after this step."""
-        self._resumed.clear()
-        self._paused.set()
-
-    def resume(self) -> None:
-        """Go on."""
-        self._paused.clear()
-        self._resumed.set()
-
     def toggle(self) -> None:
-        """Pause, or go on."""
-        (self.resume if self._paused.is_set() else self.pause)()
+        """Pause after this step, or go on."""
+        if self._going.is_set():
+            self._going.clear()
+        else:
+            self._going.set()
 
     def __call__(self, step: Step) -> None:
         """Called after each step."""
@@ -78,7 +72,7 @@ class TrainingView:
             self._report(step)
         if last:
             self._loop.take(1.0)
-        elif self._paused.is_set():
+        elif not self._going.is_set():
             self._hold(step)
 
     def _hold(self, step: Step) -> None:
@@ -87,20 +81,23 @@ class TrainingView:
         self._report(step)
         self._loop.take(1.0)
         seen = time.monotonic()
-        while not self._resumed.wait(POLL_SECONDS) and not interrupt_requested():
+        while not self._going.wait(POLL_SECONDS) and not interrupt_requested():
             now = time.monotonic()
             if self._loop.visitors:
                 seen = now
             elif now - seen > ABSENCE:
                 print("tsplat: the page was closed: the paused fit goes on", file=sys.stderr)
-                self.resume()
+                self._going.set()
         self._loop.take(SHARE)
         self._report(step)
 
     def _snapshot(self, step: Step) -> None:
-        self._loop.show(copy.deepcopy(step.gaussians))
+        try:
+            self._loop.show(copy.deepcopy(step.gaussians))
+        except (MemoryError, RuntimeError) as error:           # torch has RuntimeErrors for it
+            warnings.warn(f"no copy of the scene to look at: {error}", stacklevel=2)
         self._next_snapshot = time.monotonic() + SNAPSHOT_SECONDS
 
     def _report(self, step: Step) -> None:
-        self.tell(Report(step.number, self._steps, step.loss, step.psnr, len(step.gaussians), self._paused.is_set()))
+        self.tell(Report(step.number, self._steps, step.loss, step.psnr, len(step.gaussians), not self._going.is_set()))
         self._next_report = time.monotonic() + TELL_SECONDS

@@ -56,6 +56,7 @@ class Screen:
 
     def __init__(self, browser: Any, url: str, wait: Wait, folder: Path) -> None:
         self.tab = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
+        self.tab.set_default_timeout(60_000)
         self.requests: list[str] = []
         self.tab.on("request", lambda request: self.requests.append(request.url))
         self.tab.goto(f"{url}?fixedDpr=1")                   # else viser lowers the resolution on a slow machine

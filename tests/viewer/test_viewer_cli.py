@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -113,6 +114,25 @@ def test_a_fit_with_a_page_that_nobody_opens_is_a_fit(capture_folder: Path, tmp_
     assert (tmp_path / "a" / "scene.ply").read_bytes() == (tmp_path / "b" / "scene.ply").read_bytes()
     assert run("fit", capture_folder, "-o", tmp_path / "c", "--view-port", 0, *SHORT) == 2
     assert "--view-port: expected only with --view" in capsys.readouterr().err
+
+
+@needs_viser
+@pytest.mark.parametrize("ctrl_c", [False, True])
+def test_a_page_that_is_open_stays_after_the_fit(ctrl_c: bool, capture_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                                 capsys: pytest.CaptureFixture[str]) -> None:
+    from tsplat.viewer.page import Page
+
+    looks = iter([True, True, False])
+
+    def sleep(seconds: float) -> None:
+        if ctrl_c:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(Page, "visited", property(lambda page: next(looks)))
+    monkeypatch.setattr("tsplat.cli.fit.time", SimpleNamespace(sleep=sleep))
+    assert run("fit", capture_folder, "-o", tmp_path, "--view", "--view-port", 0, *SHORT) == 0
+    assert capsys.readouterr().out.endswith("the page stays until it is closed (or Ctrl-C)\n")
+    assert (next(looks, None) is None) is not ctrl_c
 
 
 @needs_viser

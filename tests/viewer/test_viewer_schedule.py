@@ -3,10 +3,9 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import numpy as np
 import pytest
 
-from tsplat.viewer.schedule import DIVISORS, PROMPT, REST, Frame, Job, Schedule, Visitor, Wish
+from tsplat.viewer.schedule import DIVISORS, PROMPT, REST, Job, Schedule, Visitor, Wish
 from tsplat.viewer.view import Settings
 from tsplat.viewer.viewpoint import Viewpoint
 
@@ -177,8 +176,3 @@ def test_settled_does_not_wait_for_those_who_move() -> None:
     world.schedule.wish(visitor, wish(1.0), 0.0)
     assert world.schedule.settled(0.5 * REST)
     assert not world.schedule.settled(1.5 * REST)
-
-
-def test_a_frame_says_what_it_is() -> None:
-    frame = Frame(np.zeros((2, 3, 3), np.uint8), wish(), 4, 0.5)
-    assert frame.wish.viewpoint.camera(frame.divisor).width == 160

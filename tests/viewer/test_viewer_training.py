@@ -15,6 +15,7 @@ from compare import assert_same_bits, threads
 
 import tsplat.viewer.training
 from tsplat.fit import FitConfig, FitResult, Step, fit
+from tsplat.fit.interrupt import interrupt_requested
 from tsplat.scene import Capture
 from tsplat.viewer import RenderLoop, Settings, TrainingView, draw_view
 from tsplat.viewer.schedule import Frame, Wish
@@ -162,5 +163,6 @@ def test_ctrl_c_ends_a_pause_with_a_checkpoint(capture: Capture, tmp_path: Path)
         with pytest.raises(KeyboardInterrupt, match="stopped after step 1 of 60; the same call goes on"):
             fit(capture, CONFIG, tmp_path, progress=False, callbacks=[training])
     assert (tmp_path / "checkpoint.pt").exists()
-    result = fit(capture, CONFIG, tmp_path, progress=False)    # and it is no longer requested
+    assert not interrupt_requested()                                   # any more
+    result = fit(capture, CONFIG, tmp_path, progress=False)
     assert_same_bits(parameters(result), parameters(fit(capture, CONFIG, progress=False)))

@@ -15,7 +15,7 @@ class Interrupt:
     requested = False
 
 
-_current = Interrupt()                     # of the fit in the main thread, or of the last one
+_current = Interrupt()                     # of the fit in the main thread, if there is one
 
 
 def interrupt_requested() -> bool:
@@ -46,3 +46,4 @@ def deferred_interrupt() -> Iterator[Interrupt]:
         yield interrupt
     finally:
         signal.signal(signal.SIGINT, previous)
+        _current = Interrupt()

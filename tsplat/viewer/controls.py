@@ -61,7 +61,8 @@ class Controls:
         inputs: list[Any] = [self._mode, self._size, self._background]
         self._degree = self._antialiased = None
         if sh_degree:
-            self._degree = gui.add_slider("SH degree", min=0, max=sh_degree, step=1, initial_value=sh_degree,
+            degree = sh_degree if initial.sh_degree is None else min(initial.sh_degree, sh_degree)
+            self._degree = gui.add_slider("SH degree", min=0, max=sh_degree, step=1, initial_value=degree,
                                           hint="How much colours change with the direction from which they are seen")
             inputs.append(self._degree)
         if sh_degree is not None:
@@ -130,16 +131,16 @@ class Controls:
         wish = self._visitor.wish
         pixels = None if wish is None else self._loop.sharp(wish)
         if pixels is not None:
-            self._client.send_file_download("tsplat.png", png(pixels), save_immediately=True)
+            self._client.send_file_download("tsplat.png", _png(pixels), save_immediately=True)
 
 
 def _viewpoint(camera: viser.CameraHandle) -> Viewpoint:
-    scale = min(1.0, MAX_SIDE / max(camera.image_width, camera.image_height))
+    scale = min(1.0, MAX_SIDE / max(1, camera.image_width, camera.image_height))
     return Viewpoint(tuple(camera.wxyz.tolist()), tuple(camera.position.tolist()), camera.fov,
                      *(max(1, round(scale * side)) for side in (camera.image_width, camera.image_height)))
 
 
-def png(pixels: Pixels) -> bytes:
+def _png(pixels: Pixels) -> bytes:
     """A PNG file."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "picture.png"

@@ -8,8 +8,9 @@ import traceback
 from collections.abc import Callable
 from types import TracebackType
 
+from tsplat.pictures.modes import Scene
 from tsplat.viewer.schedule import Frame, Job, Schedule, Visitor, Wish
-from tsplat.viewer.view import Pixels, Scene, draw_view
+from tsplat.viewer.view import Pixels, draw_view
 
 
 class RenderLoop:

@@ -141,6 +141,7 @@ class _Server(viser.ViserServer):
 
 
 def _start(host: str, port: int) -> viser.ViserServer:
+    """A server that listens there and nowhere else."""
     if not 0 <= port < 1 << 16:
         raise ValueError(f"port: expected 0 (any) to 65535; got {port}")
     try:                                                         # viser would take the next free port, or wait for ever if there is none

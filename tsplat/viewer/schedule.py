@@ -122,10 +122,11 @@ class Schedule:
             elif visitor.shown is not None:
                 divisor, due = visitor.shown // 2, max(self._free, visitor.changed + REST)
             if due <= now:
-                jobs.append((not visitor.moved, visitor.shown is not None, visitor.turn, Job(visitor, visitor.wish, divisor, self._edition)))
+                rank = not visitor.moved, visitor.shown is not None, visitor.turn
+                jobs.append((rank, Job(visitor, visitor.wish, divisor, self._edition)))
             soonest = due if soonest is None else min(due, soonest)
         if jobs:
-            return min(jobs, key=lambda job: job[:-1])[-1]
+            return min(jobs, key=lambda ranked: ranked[0])[1]
         return None if soonest is None else soonest - now
 
     def done(self, job: Job, seconds: float, now: float) -> None:

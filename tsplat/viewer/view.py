@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from tsplat.camera import Camera
 from tsplat.checks import check_choice
 from tsplat.pictures import MODES, Mode, draw_layers, picture
+from tsplat.pictures.modes import Scene
 from tsplat.scene import Gaussians, Spheres
 
-Scene: TypeAlias = Gaussians | Spheres
 Pixels: TypeAlias = NDArray[np.uint8]
 
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from tsplat.camera import Camera
 from tsplat.fit.initial import view_cube
 from tsplat.pictures import orbit
+from tsplat.pictures.modes import Scene
 from tsplat.scene import Capture, Spheres
-from tsplat.viewer.view import Scene
 
 SIZE = (800, 600)            # of the start's picture where no page says another
 

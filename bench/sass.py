@@ -11,7 +11,6 @@ from __future__ import annotations
 import argparse
 import collections
 import contextlib
-import json
 import os
 import re
 import subprocess
@@ -24,6 +23,7 @@ os.environ.pop("TRITON_INTERPRET", None)
 
 import torch
 import triton
+from output import add_json, print_json
 from triton.backends.compiler import GPUTarget
 from triton.runtime.jit import JITFunction
 
@@ -185,7 +185,7 @@ def main() -> None:
     parser.add_argument("--kernels", default="", help="only kernels whose name contains this")
     parser.add_argument("--quick", action="store_true", help="one or two variants of each kernel")
     parser.add_argument("--loops", action="store_true", help="the instruction mix of the blending loops")
-    parser.add_argument("--json", action="store_true", help="print JSON instead of markdown")
+    add_json(parser)
     args = parser.parse_args()
     rows: list[Usage] = []
     for target in args.targets:
@@ -196,7 +196,7 @@ def main() -> None:
                 rows += [usage(target, label, k) for k in kernels if args.kernels in k.metadata.name]
     rows = list({u[:3]: u for u in rows}.values())
     if args.json:
-        print(json.dumps([u._asdict() for u in rows]))
+        print_json([u._asdict() for u in rows])
         return
     print("| target | kernel | variant | registers | spills | shared | warps/SM | instructions/pair |\n" + "| --- " * 8 + "|")
     for u in rows:

@@ -121,6 +121,19 @@ def test_an_older_clip_stays_until_the_new_one_is_whole(tmp_path: Path, name: st
     assert (tmp_path / name).read_text() == "old"
 
 
+def test_another_reader_of_gifs(tmp_path: Path) -> None:
+    """ffmpeg's; the means of dithered pixels are right to a twelfth of a step between two colours, 1/6 to 1/5 apart."""
+    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    write_clip(tmp_path / "a.gif", (color.expand(32, 48, 3) for color in COLORS), fps=20)
+    reader = ffmpeg.read_frames(str(tmp_path / "a.gif"))
+    about = next(reader)
+    assert (about["size"], about["fps"]) == ((48, 32), 20)
+    frames = [torch.frombuffer(bytearray(data), dtype=torch.uint8).view(32, 48, 3).float() / 255 for data in reader]
+    assert len(frames) == len(COLORS)
+    for frame, color in zip(frames, COLORS, strict=True):
+        torch.testing.assert_close(frame.mean((0, 1)), color, atol=1 / 60, rtol=0)
+
+
 def test_mp4(tmp_path: Path) -> None:
     """H.264, yuv420p, an even size; colours as a player decodes them, to the steps of 8 bits of brightness and colour."""
     ffmpeg = pytest.importorskip("imageio_ffmpeg")

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from tsplat.camera import Camera
-from tsplat.pictures import MODES, Layers, depth_range, draw_layers, picture, viridis
+from tsplat.pictures import MODES, Layers, camera_points, depth_range, draw_layers, normals, picture, viridis
 from tsplat.scene import Gaussians, Spheres
 
 VIEW = Camera.look_at((0, 0, -4), (0, 0, 0), width=24, height=16, fov=50)
@@ -106,6 +106,15 @@ def test_one_range_for_a_clip_and_no_regard_to_a_few_strays() -> None:
     assert depth_range(Gaussians.random(0), [VIEW]) == (0.0, 1.0)
 
 
+def test_a_flat_picture_has_one_color() -> None:
+    """Though depths differ by their rounding."""
+    layers = flat(3.0)
+    assert layers.depth is not None
+    noisy = layers.depth * (1 + 2e-7 * torch.randn(16, 24))
+    image = picture(layers._replace(depth=noisy), VIEW, "depth", background=WHITE)
+    assert float((image - image.mean((0, 1))).abs().max()) < 1 / 255
+
+
 def test_viridis() -> None:
     pyplot = pytest.importorskip("matplotlib")
     x = torch.linspace(0, 1, 256, dtype=torch.float64)
@@ -132,4 +141,8 @@ def test_errors(cloud: Gaussians) -> None:
         picture(layers, VIEW, "colour")         # type: ignore[arg-type]
     with pytest.raises(ValueError, match="^background: expected shape"):
         picture(layers, VIEW, background=torch.ones(4))
+    with pytest.raises(ValueError, match=r"^depth: expected shape \[16, 24\]; got \[3, 3\]"):
+        normals(torch.ones(3, 3), torch.ones(3, 3, dtype=torch.bool), VIEW)
+    with pytest.raises(ValueError, match="^camera: expected one camera; got a batch of 1"):
+        camera_points(torch.ones(16, 24), batch)
     assert set(MODES) == {"color", "depth", "alpha", "normals"}

@@ -80,8 +80,9 @@ def run(options: argparse.Namespace) -> None:
         write_clip(out, tqdm(pictures, total=len(cameras), unit="frame", leave=False, disable=None), options.fps or FPS)
         print(out)
         return
+    digits = max(3, len(str(len(cameras) - 1)))
     for i, image in enumerate(pictures):
-        path = out if options.orbit is None and options.path is None else out.with_name(f"{out.stem}_{i:03d}{out.suffix}")
+        path = out if options.orbit is None and options.path is None else out.with_name(f"{out.stem}_{i:0{digits}d}{out.suffix}")
         write_image(path, image)
         print(path)
 

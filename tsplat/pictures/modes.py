@@ -20,6 +20,7 @@ Mode = Literal["color", "depth", "alpha", "normals"]
 MODES: tuple[Mode, ...] = get_args(Mode)
 SOLID = 0.5                 # alpha from which a pixel has a normal, and a depth that counts
 PROBE = 128                 # pixels of the longer side of the views that `depth_range` looks at
+FLATTEST = 1.001            # far over near, at least: the rounding of a plane is not to have all the colours
 QUANTILES = 0.01, 0.99      # of solid depths: what near and far are, so that a few stray splats do not take all the colours
 
 
@@ -77,8 +78,8 @@ def picture(layers: Layers, camera: Camera, mode: Mode = "color", *, background:
         camera: which they were drawn with.
         mode: one of the above.
         background: `[3]` in 0..1, or None for a picture with alpha.
-        depth_range: camera z of near and far, or None for what `depth_range` finds in this
-            view. A clip needs one for all, lest it flicker.
+        depth_range: camera z of near and far, or None for what the function `depth_range` would find in this view. A clip needs one for
+            all, lest it flicker.
 
     Returns:
         `[H, W, 3]` in 0..1, or with alpha `[H, W, 4]`, whose colours are not multiplied by it. The picture of alpha has 3 channels.
@@ -94,7 +95,7 @@ def picture(layers: Layers, camera: Camera, mode: Mode = "color", *, background:
     elif layers.depth is None:
         raise ValueError(f"layers: expected depth for the mode {mode!r}; got None")
     elif mode == "depth":
-        near, far = _range_of([layers]) if depth_range is None else depth_range
+        near, far = _range_of([_solid_depths(layers)]) if depth_range is None else depth_range
         if not 0 <= near < far:
             raise ValueError(f"depth_range: expected 0 <= near < far; got {near} and {far}")
         colors = viridis((far - layers.depth) / (far - near)) * alpha
@@ -112,17 +113,22 @@ def depth_range(scene: Scene, cameras: Iterable[Camera], *, antialiased: bool = 
 
     The 1% and the 99% quantile of camera z over all pixels whose alpha is at least 0.5; 0 and 1 if there is none.
     """
-    views = []
+    depths = []
     for camera in cameras:
         scale = min(1.0, PROBE / max(camera.width, camera.height))
         size = (max(1, round(scale * side)) for side in (camera.width, camera.height))
-        views.append(draw_layers(scene, camera.resized(*size), antialiased=antialiased))
-    return _range_of(views)
+        depths.append(_solid_depths(draw_layers(scene, camera.resized(*size), antialiased=antialiased)))
+    return _range_of(depths)
 
 
-def _range_of(views: Sequence[Layers]) -> tuple[float, float]:
-    depths = torch.cat([view.depth[view.alpha >= SOLID] for view in views if view.depth is not None])
-    if not len(depths):
+def _solid_depths(layers: Layers) -> Tensor:
+    assert layers.depth is not None
+    return layers.depth[layers.alpha >= SOLID]
+
+
+def _range_of(depths: Sequence[Tensor]) -> tuple[float, float]:
+    every = torch.cat([torch.empty(0), *(values.cpu() for values in depths)])
+    if not len(every):
         return 0.0, 1.0
-    near, far = quantiles(depths, QUANTILES)
-    return near, max(far, near * (1 + 1e-6), 1e-30)
+    near, far = quantiles(every, QUANTILES)
+    return near, max(far, near * FLATTEST) or 1.0

@@ -9,6 +9,7 @@ from torch import Tensor
 from torch.nn.functional import normalize, pad
 
 from tsplat.camera import Camera
+from tsplat.checks import check_tensor
 
 EDGE = 2.0
 """A step to the next pixel that is this many times as long as the one to the other side crosses an edge."""
@@ -18,7 +19,13 @@ def camera_points(depth: Tensor, camera: Camera) -> Tensor:
     """The points `[H, W, 3]` in the camera's axes that pixels of depth (camera z) `[H, W]` show: the inverse of the projection.
 
     NaN where a fisheye sees more than 90 degrees off its axis, which has no such depth.
+
+    Raises:
+        ValueError: for a batch of cameras, and for depth of another size than the camera's.
     """
+    if camera.batched:
+        raise ValueError(f"camera: expected one camera; got a batch of {len(camera)}")
+    check_tensor("depth", depth, (camera.height, camera.width))
     rows, columns = (torch.arange(n, dtype=depth.dtype, device=depth.device) + 0.5 for n in (camera.height, camera.width))
     K = camera.Ks.to(depth)
     x, y = (columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1]

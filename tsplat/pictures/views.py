@@ -55,8 +55,8 @@ def orbit(scene: Scene, frames: int, *, width: int, height: int, fov: float = 50
 def capture_path(capture: Capture, frames: int, *, closed: bool = False) -> list[Camera]:
     """A smooth path, at an even speed, through cameras of a capture, with the lens and the picture size of the first of them.
 
-    It goes through the photos to train on (of more than one for 15 frames, every second, third, ...), on a short round trip through them
-    rather than in the order of their names, which need not be that of a walk.
+    It goes by the photos to train on (of more than one for 15 frames, only so many, evenly chosen), on a short way through them rather
+    than in the order of their names, which need not be that of a walk.
 
     Args:
         capture: with at least one photo.

@@ -150,7 +150,7 @@ def _png(pixels: Pixels) -> bytes:
 
 def _degrees(fov: float) -> float:
     """As the slider can show them."""
-    return min(max(math.degrees(fov), NARROWEST), WIDEST)
+    return round(min(max(math.degrees(fov), NARROWEST), WIDEST), 1)
 
 
 def _bytes(color: tuple[float, float, float]) -> tuple[int, int, int]:

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from tsplat import Camera, rasterize
-from tsplat.pictures import Mode, draw_layers, picture
+from tsplat.pictures import MODES, Mode, draw_layers, picture
 from tsplat.scene import Gaussians, Spheres
 from tsplat.viewer import Settings, draw_view
 from tsplat.viewer.view import Pixels
@@ -60,6 +60,14 @@ def test_modes(kind: str, mode: Mode, camera: Camera, request: pytest.FixtureReq
     got = draw_view(scene, camera, Settings(mode, background=(0.0, 1.0, 0.0)))
     assert (got == pixels(want)).all()
     assert len(np.unique(got)) > 50
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="there is no GPU")
+@pytest.mark.parametrize("mode", MODES)
+def test_on_a_gpu(mode: Mode, gaussians: Gaussians, camera: Camera) -> None:
+    here = draw_view(gaussians, camera, Settings(mode))
+    there = draw_view(gaussians.to("cuda"), camera, Settings(mode))
+    assert np.abs(here.astype(int) - there).mean() < 0.1                # of 255: float32 in another order; a normal at an edge may be another
 
 
 def test_it_leaves_no_traces(gaussians: Gaussians, camera: Camera) -> None:

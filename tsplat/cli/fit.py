@@ -42,7 +42,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--quiet", action="store_true", help="no progress line, which is on terminals only anyway")
     parser.add_argument("--view", action="store_true",
                         help="show a web page of the scene as it is fitted, which this machine alone can open (needs pip install 'tsplat[viewer]'). "
-                             "The command ends when the fit is done and no page is open")
+                             "The command ends when the fit is done and no page is open; a paused fit goes on when none has been open for 5 seconds")
     parser.add_argument("--view-port", type=int, metavar="PORT", help=f"with --view: of the page; 0 for any (default: {VIEW_PORT})")
     add_device(parser)
     add_fields(parser)

@@ -150,6 +150,16 @@ def test_a_batch_indexes_like_a_tensor() -> None:
         one[0]
 
 
+@pytest.mark.parametrize("model", MODELS)
+def test_a_resized_camera_sees_the_same(model: str) -> None:
+    before = camera(1, WIDTH, HEIGHT, model=model)
+    after = before.resized(3 * WIDTH, 2 * HEIGHT)
+    assert (after.width, after.height, after.model) == (3 * WIDTH, 2 * HEIGHT, model)
+    p = points(5)[:, 0].T
+    pixels = [definition(p, cam.Ks[0], model)[0] for cam in (before, after)]
+    assert_close(pixels[1], pixels[0] * f64([3.0, 2.0]), 2e-15)                      # as above
+
+
 def test_to_moves_both_matrices() -> None:
     moved = camera(2).to(torch.float32)
     assert moved.viewmats.dtype == moved.Ks.dtype == torch.float32

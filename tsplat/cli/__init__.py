@@ -1,4 +1,4 @@
-"""The command line: `tsplat fit`, `eval`, `compare`, `render`, `convert` and `info`.
+"""The command line: `tsplat fit`, `eval`, `compare`, `render`, `view`, `convert` and `info`.
 
 A command is a module here with `HELP` (one line), `USAGE`, `DESCRIPTION`, `EXAMPLES`, `add_arguments(parser)` and `run(options)`.
 """
@@ -12,18 +12,19 @@ import warnings
 from collections.abc import Sequence
 
 import tsplat
-from tsplat.cli import compare, convert, eval, fit, info, render
+from tsplat.cli import compare, convert, eval, fit, info, render, view
 from tsplat.cli.parser import Parser
 
 INTERRUPTED = 130                    # the exit status of a shell's command that was stopped by Ctrl-C
 UNREAD = 141                         # and of one that SIGPIPE ended: nobody reads what it writes
-COMMANDS = {"fit": fit, "eval": eval, "compare": compare, "render": render, "convert": convert, "info": info}
-DESCRIPTION = "Fit, render, compare, convert and inspect scenes of Gaussians and spheres."
+COMMANDS = {"fit": fit, "eval": eval, "compare": compare, "render": render, "view": view, "convert": convert, "info": info}
+DESCRIPTION = "Fit, render, view, compare, convert and inspect scenes of Gaussians and spheres."
 EPILOG = f"""
 examples:
   tsplat fit --synthetic -o out                        a first fit, without data
   tsplat fit capture -o out --downscale 4              photos posed by COLMAP
   tsplat render out/scene.ply -o turn.gif --orbit 60   or .png, .mp4; or depth
+  tsplat view out/scene.ply                            in a web page
   tsplat info out/scene.ply --json                     nothing but JSON
 
 exit status:

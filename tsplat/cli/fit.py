@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import sys
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 from tsplat.cli.common import add_device, add_fields, config_of, device_of, print_mean
-from tsplat.fit import FitConfig, fit
+from tsplat.fit import FitConfig, Step, fit
 from tsplat.fit.output import read_config
-from tsplat.scene import write_synthetic_capture
+from tsplat.scene import Capture, load_capture, write_synthetic_capture
 
 HELP = "fit a scene to photos"
 USAGE = "tsplat fit DATA -o OUT [options]"
@@ -22,7 +25,10 @@ EXAMPLES = """
   tsplat fit --synthetic -o out
   tsplat fit capture -o out --downscale 4 --steps 7000 --max-splats 200000
   tsplat fit capture -o again --config out/config.json
+  tsplat fit capture -o out --view                     watch it in a web page
 """
+VIEW_PORT = 8080
+POLL_SECONDS = 0.2
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,6 +41,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--config", type=Path, metavar="FILE", help="a config.json, for what is not given here: makes the same scene again")
     parser.add_argument("--fresh", action="store_true", help="start anew instead of going on from OUT/checkpoint.pt")
     parser.add_argument("--quiet", action="store_true", help="no progress line, which is on terminals only anyway")
+    parser.add_argument("--view", action="store_true",
+                        help="show a web page of the scene as it is fitted, which this machine alone can open (needs pip install 'tsplat[viewer]'). "
+                             "The command ends when the fit is done and no page is open; a paused fit goes on when none has been open for 5 seconds")
+    parser.add_argument("--view-port", type=int, metavar="PORT", help=f"with --view: of the page; 0 for any (default: {VIEW_PORT})")
     add_device(parser)
     add_fields(parser)
 
@@ -48,9 +58,29 @@ def run(options: argparse.Namespace) -> None:
         if not (data / "sparse" / "0" / "points3D.txt").exists():              # the file that is written last
             print(f"rendering a small capture of a made-up scene to {data}")
             write_synthetic_capture(data)
+    if options.view_port is not None and not options.view:
+        raise ValueError("--view-port: expected only with --view")
+    if not options.view:
+        _fit(options, data, config)
+        return
+
+    from tsplat.viewer.page import training_page
+
+    capture = load_capture(data, downscale=config.downscale, test_every=config.test_every)
+    with training_page(capture, config, port=VIEW_PORT if options.view_port is None else options.view_port) as (page, training):
+        print(f"the fit can be watched at {page.url}", flush=True)
+        _fit(options, capture, config, training)
+        if page.visited:
+            print("the page stays until it is closed (or Ctrl-C)", flush=True)
+        with contextlib.suppress(KeyboardInterrupt):                              # the fit is done: this is no failure
+            while page.visited:
+                time.sleep(POLL_SECONDS)
+
+
+def _fit(options: argparse.Namespace, data: Capture | str | Path, config: FitConfig, *callbacks: Callable[[Step], None]) -> None:
     try:
         result = fit(data, config, options.out, resume=not options.fresh, progress=sys.stderr.isatty() and not options.quiet,
-                     device=device_of(options.device))
+                     callbacks=callbacks, device=device_of(options.device))
     except KeyboardInterrupt as interrupt:
         checkpoint = options.out / "checkpoint.pt"
         if not interrupt.args and checkpoint.exists():                         # while reading photos, or in the evaluation

@@ -92,7 +92,8 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
         resume: go on from the checkpoint in `out`, if there is one. A fit that was interrupted and resumed ends, on the same
             machine, with the same bits as one that was not.
         progress: show a line with loss, PSNR and number of splats.
-        callbacks: each is called after each step; `tsplat.fit.to_writer` makes one for TensorBoard.
+        callbacks: each is called after each step; `tsplat.fit.to_writer` makes one for TensorBoard, `tsplat.viewer.page.training_page` one for a
+            web page.
         device: where to compute.
 
     Raises:

@@ -14,7 +14,7 @@ from tsplat.camera import MODELS, Camera
 from tsplat.checks import check_choice, check_number, check_size, check_tensor
 
 if TYPE_CHECKING:
-    from torch.distributed import ProcessGroup          # some builds of torch have none
+    from torch.distributed import ProcessGroup  # some builds of torch have none
 
 TILE = 8
 """Pixels along the side of a tile. On a CPU 8 beats 4, 6 and 16: smaller tiles have more hits to sort, larger ones more idle pairs."""
@@ -114,7 +114,7 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
     """
     ranks = 1
     if group is not None:
-        from tsplat import distributed                  # only where it is used: some builds of torch have no torch.distributed
+        from tsplat import distributed  # only where it is used: some builds of torch have no torch.distributed
         ranks = distributed.check_group(group)
         group = group if ranks > 1 else None            # one has nothing to exchange
     _check(means, quats, scales, opacities, colors, camera, sh_degree, covars, background, depth, eps2d, alpha_max, screen_offset, absgrad,

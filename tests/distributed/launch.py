@@ -13,8 +13,8 @@ SECONDS = 300
 """How long all checks together may take on a busy machine; on a quiet one it is 10 to 20."""
 
 
-def run_ranks(script: str, ranks: int, folder: Path, seconds: float = SECONDS) -> None:
-    """Run `script rank ranks folder` in as many processes. Where one of them fails the others, which wait for it, are ended at once.
+def run_ranks(script: Path, ranks: int, folder: Path, *arguments: str, seconds: float = SECONDS) -> None:
+    """Run `script rank ranks folder arguments` in as many processes. Where one of them fails the others, which wait for it, are ended at once.
 
     Raises:
         AssertionError: with what they printed; also after so many seconds.
@@ -26,14 +26,13 @@ def run_ranks(script: str, ranks: int, folder: Path, seconds: float = SECONDS) -
     try:
         for rank, log in enumerate(logs):
             with log.open("w") as out:
-                processes.append(subprocess.Popen([sys.executable, "-W", "ignore", str(Path(__file__).parent / script), str(rank), str(ranks),
-                                                   str(folder)], env=environment, stdout=out, stderr=subprocess.STDOUT))
+                command = [sys.executable, "-W", "ignore", str(script), str(rank), str(ranks), str(folder), *arguments]
+                processes.append(subprocess.Popen(command, env=environment, stdout=out, stderr=subprocess.STDOUT))
         end = time.monotonic() + seconds
-        while any(p.poll() is None for p in processes):
-            if time.monotonic() > end or any(p.returncode for p in processes):
-                break
-            time.sleep(0.05)
         codes = [p.poll() for p in processes]
+        while None in codes and not any(codes) and time.monotonic() < end:
+            time.sleep(0.05)
+            codes = [p.poll() for p in processes]
     finally:
         for p in processes:
             p.kill()

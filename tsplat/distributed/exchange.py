@@ -64,7 +64,8 @@ def send(rows: Drawn, counts: Tensor, group: ProcessGroup) -> Drawn:
     first = torch.arange(cameras, device=origin.device) * most + theirs.cumsum(0) - theirs  # [W, C], where these splats go
     shift = first.flatten() - (origin.cumsum(0) - origin)
     slots = shift.repeat_interleave(origin, output_size=len(received)) + torch.arange(len(received), device=origin.device)
-    padded = received.new_zeros(cameras * most, received.shape[1]).index_copy(0, slots, received).unflatten(0, (cameras, most))
-    means2d, conics, opacities, colors, depths, *absgrad = padded.split([f.shape[1] for f in record], -1)
+    padded = received.new_zeros(cameras * most, received.shape[1]).index_copy(0, slots, received)
+    padded = torch.unflatten(padded, 0, (cameras, most))                                    # not view(.., -1), of which [] leaves the -1 open
+    means2d, conics, opacities, colors, depths, *absgrad = torch.split(padded, [f.shape[1] for f in record], -1)
     drawn = (torch.arange(most, device=origin.device) < per_camera[:, None]).to(torch.int32)                    # [C, M]
     return Drawn(drawn[..., None].expand(-1, -1, 2), means2d, conics, opacities[..., 0], colors, depths[..., 0], absgrad[0] if absgrad else None)

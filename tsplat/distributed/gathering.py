@@ -33,7 +33,7 @@ def gather_cameras(viewmats: Tensor, Ks: Tensor, group: ProcessGroup, same: Mapp
                       "requires_grad of the cameras (1: yes, 0: no or no_grad)": cameras,
                       "requires_grad of the splats (1: yes, 0: no or no_grad)": splats}, viewmats, group)
     packed = torch.cat([viewmats.flatten(1), Ks.flatten(1)], 1)                             # [C, 25]: one collective, backward too
-    viewmats, Ks = all_gather(packed, group).flatten(0, 1).split([16, 9], 1)
+    viewmats, Ks = torch.split(all_gather(packed, group).flatten(0, 1), [16, 9], 1)
     return viewmats.reshape(-1, 4, 4), Ks.reshape(-1, 3, 3)
 
 

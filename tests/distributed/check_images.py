@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import importlib.util
 from typing import Any
 
 import scenes
 import torch
 import torch.distributed as dist
-from compare import assert_close, assert_same_bits
+from backends import KERNELS
+from compare import assert_close, assert_same_bits, leaves
 from ranks import Ranks, expect
 from shards import Shards, compare, outputs, render, shards_of
 from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
 
 from tsplat import Camera, rasterize
 
@@ -38,6 +41,23 @@ def check_ranks_with_nothing_visible(ranks: Ranks) -> None:
     compare(ranks, shards)
 
 
+def check_what_travels(ranks: Ranks) -> None:
+    """Of each visible splat 7 numbers and its colour, there and back; whether SH coefficients, depths or covariances are used."""
+    class Widths(TorchDispatchMode):
+        def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+            if "all_to_all_single" in function.name() and args[0].dtype == torch.float64 and args[0].ndim == 2:
+                widths.append(args[0].shape[1])
+            return function(*args, **(kwargs or {}))
+
+    arguments = scenes.splats(10)._asdict() | {"colors": scenes.sh_coefficients(10, 3)}
+    inputs = leaves(*arguments.values())
+    widths: list[int] = []
+    with Widths():
+        rasterize(**dict(zip(arguments, inputs, strict=True)), camera=scenes.camera(), sh_degree=3, depth="expected",
+                  group=ranks.group).image.sum().backward()
+    assert widths[1:] == [10, 10], widths                       # the first: what the ranks compare
+
+
 def check_equal_depths(ranks: Ranks) -> None:
     """The order is that of the ranks, then that of the splats."""
     n = 12
@@ -51,6 +71,14 @@ def check_splats_that_are_not_finite(ranks: Ranks) -> None:
     shards.shared["means"][::5] = torch.nan
     (shards.shared | shards.views)["colors"][..., 1::5, 0] = torch.inf
     compare(ranks, shards)
+
+
+def check_on_the_kernels(ranks: Ranks) -> None:
+    """What arrives is laid out in another way than what projection gives."""
+    if KERNELS.name == "interpreter" and importlib.util.find_spec("triton") is not None:
+        shards = Shards([3] * ranks.count, 2, scenes.camera(2 * ranks.count, 8, 8), scenes.splats(3 * ranks.count, spread=0.8)._asdict())
+        with KERNELS.active():
+            compare(ranks, shards)
 
 
 def check_float32(ranks: Ranks) -> None:

@@ -38,7 +38,8 @@ process, which decides between equal depths, so that images are those of one pro
 All ranks make the same calls in the same order. What only one rank can see (a tensor of a wrong shape) raises on that rank only; `torchrun`
 then ends the others. Under torch.compile, what differs between ranks raises without saying what.
 
-Memory per rank: projection holds about 32 bytes per own splat and camera of *all* ranks in forward, and as much in backward.
+Memory: per own splat and camera of *all* ranks, seen or not, projection holds 44 bytes in float32 (80 with SH coefficients), and backward
+another 40: 4.8 GB per rank for 40M splats in all and one camera per rank, whatever the number of ranks (`bench/distributed.py`).
 """
 
 from tsplat.distributed.collectives import check_group as check_group

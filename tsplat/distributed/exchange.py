@@ -55,7 +55,7 @@ def send(rows: Drawn, counts: Tensor, group: ProcessGroup) -> Drawn:
     counts, ones = counts.view(ranks, -1), [1] * ranks                                      # [W, C], destination and its cameras
     theirs = all_to_all(counts, ones, ones, group)                                          # [W, C], origin and own cameras
     per_camera = theirs.sum(0)
-    *numbers, most = torch.cat([counts.sum(1), theirs.sum(1), per_camera.amax(0, keepdim=True)]).tolist()       # the one wait for a GPU
+    *numbers, most = torch.cat([counts.sum(1), theirs.sum(1), per_camera.amax(0, keepdim=True)]).tolist()       # one wait for a GPU, not three
     fields = rows.means2d, rows.conics, rows.opacities[:, None], rows.colors, rows.depths[:, None], rows.absgrad
     record = [f for f in fields if f is not None]
     received = all_to_all(torch.cat(record, 1), numbers[:ranks], numbers[ranks:], group)

@@ -106,6 +106,27 @@ def check_gradients_of_the_means_on_screen(ranks: Ranks) -> None:
     assert (offset.grad[~rendering.meta.visible] == 0).all()
 
 
+def check_a_loop_is_that_of_one_process(ranks: Ranks) -> None:
+    """The loop that `tsplat.distributed` prints, five steps of it: splats end where one process moves them."""
+    shards = Shards([8] * ranks.count, 2, scenes.camera(2 * ranks.count), scenes.splats(8 * ranks.count)._asdict())
+    photos = scenes.uniform(0.0, 1.0, 2 * ranks.count, 17, 24, 3, seed=scenes.generator(5))
+    splats, cameras = shards.part(ranks.rank)
+
+    def train(arguments: dict[str, Tensor], camera: Camera, photos: Tensor, **options: Any) -> list[Tensor]:
+        inputs = leaves(*arguments.values())
+        optimiser = torch.optim.SGD(inputs, 0.5)
+        for _ in range(5):
+            image = rasterize(**dict(zip(arguments, inputs, strict=True)), camera=camera, **options).image
+            optimiser.zero_grad()
+            ((image - photos).square().mean() / (options["group"].size() if options else 1)).backward()
+            optimiser.step()
+        return inputs
+
+    whole = train(shards.shared, shards.camera, photos)
+    assert (whole[0] - shards.shared["means"]).abs().max() > 1e-3
+    assert_close(train(*shards.of(ranks.rank), photos[cameras], group=ranks.group), [v[splats] for v in whole], 1e-12)
+
+
 def check_second_derivatives(ranks: Ranks) -> None:
     """Of the sum of squares of the gradients of the means."""
     shards = Shards([10] * ranks.count, 1, scenes.camera(ranks.count), scenes.splats(10 * ranks.count)._asdict())

@@ -27,13 +27,14 @@ process, which decides between equal depths, so that images are those of one pro
 - What is minimised is the *sum* of the ranks' losses: each rank calls backward on its own, and gradients meet at the owners. So let each
   loss be a mean over the own pixels, divided by the number of ranks; then the sum is the mean over the batch of all cameras.
 - Gradients of splats must not be reduced: no DistributedDataParallel around the scene, as each splat lives on one rank only.
-- What every rank has a copy of (a network, a background) gets one gradient per rank: all-reduce these by sum. A background of the
-  rank's own needs nothing.
+- What every rank has a copy of (a network, a background, poses of all photos) gets one gradient per rank: all-reduce these by sum. What
+  belongs to the rank's own cameras needs nothing.
 - Regularisers of splats are sums over the own splats, divided by the number of splats of *all* ranks where they are means, and not by
   the number of ranks.
 - Density control works on each rank alone: `meta.radii`, `meta.means2d`, `screen_offset` and `absgrad` are `[ranks C, N]`, the own splats
-  in all cameras, those of rank 0 first. Ranks grow differently; when their numbers differ much, move splats (a plain
-  `all_to_all_single` of rows) between steps.
+  in all cameras, those of rank 0 first. With the loss above, screen-space gradients are those of a batch: the number of all cameras times
+  smaller than of a loss of one image, for which thresholds are made. Ranks grow differently; when their numbers differ much, move splats (a
+  plain `all_to_all_single` of rows) between steps.
 
 All ranks make the same calls in the same order. What only one rank can see (a tensor of a wrong shape) raises on that rank only; `torchrun`
 then ends the others. Under torch.compile, what differs between ranks raises without saying what.

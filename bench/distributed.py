@@ -50,6 +50,7 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
+import os
 import platform
 import statistics
 import tempfile
@@ -218,7 +219,8 @@ def main() -> None:
         print()
     model = print_model()
     if args.json:
-        found = {"torch": torch.__version__, "date": str(datetime.date.today()), "rows": rows, "model": model}
+        machine = f"{platform.machine()}, {os.cpu_count()} cores"
+        found = {"torch": torch.__version__, "machine": machine, "date": str(datetime.date.today()), "rows": rows, "model": model}
         args.json.write_text(json.dumps(found, indent=1) + "\n")
 
 

@@ -32,7 +32,7 @@ def check_differences_between_ranks_are_errors_on_all(ranks: Ranks) -> None:
     differ(f"camera.model (of pinhole, orthographic, fisheye): {end} 0 on rank 0 and 2 on LAST",
            dataclasses.replace(camera, model="fisheye") if odd else camera)
     differ(f"camera.near: {end} 0.01 on rank 0 and 1 on LAST", dataclasses.replace(camera, near=1.0) if odd else camera)
-    differ(f"camera.far: {end} 1e+10 on rank 0 and 9 on LAST", dataclasses.replace(camera, far=9.0) if odd else camera)
+    differ(f"camera.far: {end} 10000000000 on rank 0 and 9 on LAST", dataclasses.replace(camera, far=9.0) if odd else camera)
     differ(f"antialiased: {end} 0 on rank 0 and 1 on LAST", antialiased=odd)
     differ(f"eps2d: {end} 0.3 on rank 0 and 0.1 on LAST", eps2d=0.1 if odd else 0.3)
     differ(f"channels of colors: {end} 3 on rank 0 and 2 on LAST", arguments=base | {"colors": base["colors"][:, :2 if odd else 3]})

@@ -42,7 +42,7 @@ def check_ranks_with_nothing_visible(ranks: Ranks) -> None:
 
 
 def check_what_travels(ranks: Ranks) -> None:
-    """Of each visible splat 7 numbers and its colour, there and back; whether SH coefficients, depths or covariances are used."""
+    """Of each visible splat 7 numbers and its colour, there and back; no SH coefficients, and the depth only once."""
     class Widths(TorchDispatchMode):
         def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
             if "all_to_all_single" in function.name() and args[0].dtype == torch.float64 and args[0].ndim == 2:

@@ -46,4 +46,5 @@ def _check_agreement(same: Mapping[str, float], like: Tensor, group: ProcessGrou
     for name, values in zip(same, everyone.T.tolist(), strict=True):
         rank = next((r for r, v in enumerate(values) if v != values[0]), 0)
         if rank:
-            raise ValueError(f"{name}: expected the same on all ranks of the group; got {values[0]:g} on rank 0 and {values[rank]:g} on rank {rank}")
+            raise ValueError(f"{name}: expected the same on all ranks of the group; got {values[0]:.12g} on rank 0 and "
+                             f"{values[rank]:.12g} on rank {rank}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import TYPE_CHECKING, Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -10,8 +10,11 @@ from tsplat_reference import camera_centers, tile_counts
 from tsplat_reference.constants import ALPHA_MAX, EPS2D
 
 from tsplat import ops
-from tsplat.camera import Camera
+from tsplat.camera import MODELS, Camera
 from tsplat.checks import check_choice, check_number, check_size, check_tensor
+
+if TYPE_CHECKING:
+    from torch.distributed import ProcessGroup  # some builds of torch have none
 
 TILE = 8
 """Pixels along the side of a tile. On a CPU 8 beats 4, 6 and 16: smaller tiles have more hits to sort, larger ones more idle pairs."""
@@ -23,7 +26,8 @@ DepthMode = Literal["accumulated", "expected"]
 
 
 class Meta(NamedTuple):
-    """What happened on the way, for C cameras and N Gaussians.
+    """What happened on the way, for C cameras and N Gaussians. Of a call with a `group`: the own Gaussians in the cameras of all ranks, those
+    of rank 0 first, but `offsets` and `hits` of the own cameras.
 
     radii: int32 `[C, N, 2]`, half size in pixels of the box that a splat can touch; 0 if it is culled.
     means2d: `[C, N, 2]` in pixels; part of the graph (`meta.means2d.retain_grad()`).
@@ -70,8 +74,8 @@ class Rendering(NamedTuple):
 def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, colors: Tensor, camera: Camera, *,
               sh_degree: int | None = None, covars: Tensor | None = None, background: Tensor | None = None,
               depth: DepthMode | None = None, antialiased: bool = False, eps2d: float = EPS2D, alpha_max: float = ALPHA_MAX, drop_last: bool = False,
-              screen_offset: Tensor | None = None, absgrad: Tensor | None = None, tile: int = TILE, capacity: int | None = None
-              ) -> Rendering:
+              screen_offset: Tensor | None = None, absgrad: Tensor | None = None, tile: int = TILE, capacity: int | None = None,
+              group: ProcessGroup | None = None) -> Rendering:
     """Render N Gaussians (3D Gaussian Splatting, sections 4 and 6).
 
     Differentiable in means, quats, scales or covars, opacities, colors, background, screen_offset and the camera's matrices;
@@ -100,21 +104,36 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
         tile: pixels along the side of a tile; never visible in the result. 8, the default, is the only one on a GPU.
         capacity: room for this many hits of splats and tiles, all cameras together: then nothing waits for the GPU to count them, and CUDA
             graphs can capture the call. `meta.needed` tells how many it takes.
+        group: each rank gives splats of its own and C cameras of its own, the same number on all ranks, and gets the images of its cameras with
+            the splats of all ranks; gradients go to the owners. For W ranks, `colors`, `screen_offset` and `absgrad` that are per camera have
+            W C for C: the own splats in the cameras of all ranks. How to train so: `tsplat.distributed`.
 
     Raises:
-        ValueError, TypeError: naming the argument, what came and what is expected.
-        NotImplementedError: on a GPU where Triton is not installed, and for forward-mode derivatives.
+        ValueError, TypeError: naming the argument, what came and what is expected; on all ranks of the group where these differ.
+        NotImplementedError: on a GPU where Triton is not installed, for forward-mode derivatives, and for `capacity` with `group`.
     """
+    ranks = 1
+    if group is not None:
+        from tsplat import distributed  # only where it is used: some builds of torch have no torch.distributed
+        ranks = distributed.check_group(group)
+        group = group if ranks > 1 else None            # one has nothing to exchange
     _check(means, quats, scales, opacities, colors, camera, sh_degree, covars, background, depth, eps2d, alpha_max, screen_offset, absgrad,
-           tile, capacity)
+           tile, capacity, ranks)
     C, width, height = len(camera), camera.width, camera.height
     viewmats, Ks = (camera.viewmats, camera.Ks) if camera.batched else (camera.viewmats[None], camera.Ks[None])
+    if group is not None:
+        same = {"camera.width": width, "camera.height": height, f"camera.model (of {', '.join(MODELS)})": MODELS.index(camera.model),
+                "camera.near": camera.near, "camera.far": camera.far, "eps2d": eps2d, "antialiased": antialiased,
+                "channels of colors": colors.shape[-1], "absgrad (1: given)": absgrad is not None}
+        inputs = means, quats, scales, covars, opacities, colors, screen_offset, absgrad
+        viewmats, Ks = distributed.gather_cameras(viewmats, Ks, group, same, inputs)
+    views = C * ranks                                   # cameras of which this rank projects its splats
     radii, means2d, depths, conics, compensations = ops.project(
         means, quats, scales, covars, opacities, viewmats, Ks, width, height, camera.model, camera.near, camera.far, eps2d, antialiased)
     if screen_offset is not None:
         means2d = means2d + screen_offset
     # not expand for one camera: its gradient is a sum, a kernel
-    view_opacities = opacities * compensations if antialiased else opacities[None] if C == 1 else opacities.expand(C, -1)
+    view_opacities = opacities * compensations if antialiased else opacities[None] if views == 1 else opacities.expand(views, -1)
 
     if sh_degree is not None:
         visible = radii[..., 0] > 0                     # both are 0 of a splat that is culled
@@ -122,16 +141,20 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
         view_colors = torch.nn.functional.threshold(ops.harmonics(means, camera_centers(viewmats), colors, sh_degree, visible) + 0.5, -LEAST, 0.0)
     else:
         view_colors = colors if colors.ndim == 3 else colors[None]
-    backgrounds = None if background is None else background.expand(C, -1)
-    if depth is not None:
-        view_colors = torch.cat([view_colors.expand(C, -1, -1), depths[..., None]], -1)
-        backgrounds = None if backgrounds is None else torch.nn.functional.pad(backgrounds, (0, 1))
     # 2 kernels where isfinite().all(-1) has 5; of all norms torch is fast on a CPU for this one only (17 times). Beyond 1e19 it is infinite
     radii = radii * (torch.linalg.vector_norm(view_colors.detach(), 2, -1, keepdim=True) < torch.inf)
 
-    to_bin = means2d, radii, conics, view_opacities, depths, width, height, tile
+    drawn = radii, means2d, conics, view_opacities, view_colors, depths, absgrad
+    if group is not None:
+        drawn = distributed.exchange(distributed.Drawn(*drawn), group)
+    mask, centers, conics, view_opacities, view_colors, zs, absgrad = drawn
+    backgrounds = None if background is None else background.expand(C, -1)
+    if depth is not None:
+        view_colors = torch.cat([view_colors.expand(C, -1, -1), zs[..., None]], -1)
+        backgrounds = None if backgrounds is None else torch.nn.functional.pad(backgrounds, (0, 1))
+    to_bin = centers, mask, conics, view_opacities, zs, width, height, tile
     bins, needed = (ops.bin_splats(*to_bin), None) if capacity is None else ops.bin_splats_fixed(*to_bin, capacity)
-    image, alpha = ops.blend(means2d, conics, view_opacities, view_colors, backgrounds, absgrad, bins.ids, bins.offsets, width, height,
+    image, alpha = ops.blend(centers, conics, view_opacities, view_colors, backgrounds, absgrad, bins.ids, bins.offsets, width, height,
                              tile, alpha_max, drop_last)
     z = None
     if depth is not None:
@@ -147,14 +170,14 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
 
 def _check(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, colors: Tensor, camera: Camera,
            sh_degree: int | None, covars: Tensor | None, background: Tensor | None, depth: str | None, eps2d: float, alpha_max: float,
-           screen_offset: Tensor | None, absgrad: Tensor | None, tile: int, capacity: int | None) -> None:
+           screen_offset: Tensor | None, absgrad: Tensor | None, tile: int, capacity: int | None, ranks: int) -> None:
     """Errors that name the argument, what came and what is expected."""
     check_tensor("means", means, ("N", 3))
     if means.dtype not in (torch.float32, torch.float64):
         raise TypeError(f"means: expected dtype torch.float32 or torch.float64, as half precision cannot hold a position; got {means.dtype}")
     if not isinstance(camera, Camera):
         raise TypeError(f"camera: expected a tsplat.Camera; got {type(camera).__name__}")
-    N, C = means.shape[0], len(camera)
+    N, C, views = means.shape[0], len(camera), len(camera) * ranks
     if not C:
         raise ValueError("camera: expected at least 1 camera; got a batch of 0")
     if covars is None:
@@ -167,7 +190,7 @@ def _check(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities
     check_tensor("opacities", opacities, (N,), like=means)
     check_tensor("camera.viewmats", camera.viewmats, (..., 4, 4), like=means)
     if sh_degree is None:
-        check_tensor("colors", colors, (N, "D") if getattr(colors, "ndim", 2) < 3 else (C, N, "D"), like=means)
+        check_tensor("colors", colors, (N, "D") if getattr(colors, "ndim", 2) < 3 else (views, N, "D"), like=means)
     else:
         if not isinstance(sh_degree, int) or isinstance(sh_degree, bool):
             raise TypeError(f"sh_degree: expected an int from 0 to {MAX_DEGREE}; got {sh_degree!r}")
@@ -191,7 +214,10 @@ def _check(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities
         raise ValueError(f"alpha_max: expected a number in (0, 1); got {alpha_max}")
     for name, probe in (("screen_offset", screen_offset), ("absgrad", absgrad)):
         if probe is not None:
-            check_tensor(name, probe, (C, N, 2), like=means)
+            check_tensor(name, probe, (views, N, 2), like=means)
     check_size("tile", tile)
     if capacity is not None:
         check_size("capacity", capacity)
+        if ranks > 1:
+            raise NotImplementedError("capacity: expected None with a group of several ranks, where each call waits for the number of splats that "
+                                      "come from the others")

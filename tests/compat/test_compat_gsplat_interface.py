@@ -308,7 +308,7 @@ def test_many_channels_and_the_options_that_change_nothing() -> None:
     assert torch.equal(rasterization(**args, channel_chunk=8, segmented=True)[0], want)
 
 
-@pytest.mark.parametrize("option", [{"distributed": True}, {"with_ut": True}, {"with_eval3d": True}, {"radial_coeffs": torch.zeros(2, 4)},
+@pytest.mark.parametrize("option", [{"with_ut": True}, {"with_eval3d": True}, {"radial_coeffs": torch.zeros(2, 4)},
                                     {"tangential_coeffs": torch.zeros(2, 2)}, {"thin_prism_coeffs": torch.zeros(2, 4)}, {"ftheta_coeffs": object()},
                                     {"rolling_shutter": gsplat.RollingShutterType.ROLLING_TOP_TO_BOTTOM}, {"viewmats_rs": torch.eye(4)}])
 def test_options_that_are_not_there(option: dict[str, Any]) -> None:

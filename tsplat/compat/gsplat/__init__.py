@@ -10,13 +10,14 @@ with these differences:
 | splats that are not finite, or have a zero quaternion | NaN in image and gradients | left out, gradient 0 |
 | `meta` | a dict | a mapping, whose lists of tiles are made when first read |
 | `isect_ids`, ... of `meta` | what is rendered from | the same lists; rendered from smaller tiles, hit more exactly |
+| `distributed=True` | `meta` has lists of tiles | it has none; else the same, over the default group (`tsplat.distributed`) |
 | channels | up to 513 | any number; `channel_chunk` and `segmented` change nothing |
 | `packed=True` | less memory | the same results; less memory from blending on |
 | `tile_size` on a GPU | any (untested but 16) | a multiple of 8 in `rasterize_to_pixels` |
 | `DefaultStrategy` | never resets opacities (a slip of `&` in 1.5.3) | resets every `reset_every` steps, as documented |
 | wrong arguments | assertions | `ValueError`, `TypeError` that say what is expected |
 
-3DGUT (`with_ut`, `with_eval3d`, distortion, rolling shutter), f-theta and lidar cameras, `distributed` and 2DGS raise `NotImplementedError`.
+3DGUT (`with_ut`, `with_eval3d`, distortion, rolling shutter), f-theta and lidar cameras and 2DGS raise `NotImplementedError`.
 """
 
 from tsplat.compat.gsplat.exporter import export_splats as export_splats

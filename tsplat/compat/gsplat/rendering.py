@@ -16,7 +16,19 @@ from tsplat_reference import camera_centers
 
 from tsplat import ops
 from tsplat.checks import check_choice, check_size, check_tensor
-from tsplat.compat.gsplat.stages import Packed, check_scene, draw, fully_fused_projection, joined, per_image, scenes, sparse_rows
+from tsplat.compat.gsplat.stages import (
+    MODELS,
+    Packed,
+    blend,
+    check_scene,
+    core_model,
+    draw,
+    fully_fused_projection,
+    joined,
+    per_image,
+    scenes,
+    sparse_rows,
+)
 from tsplat.compat.gsplat.tiles import isect_offset_encode, isect_tiles
 from tsplat.rasterize import TILE
 
@@ -82,19 +94,22 @@ def rasterization(means: Tensor, quats: Tensor | None, scales: Tensor | None, op
         camera_model: "pinhole", "ortho" or "fisheye".
         covars: `[..., N, 3, 3]`, of which the upper triangles are read, instead of quats and scales.
         channel_chunk, segmented: no difference.
-        distributed, with_ut, with_eval3d, radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, rolling_shutter, viewmats_rs:
-            not there.
+        distributed: each rank of the default process group gives Gaussians and C cameras of its own and gets the images of its cameras, with
+            the Gaussians of all ranks: see `tsplat.distributed`. Without batch dimensions and colours for each camera, as in gsplat.
+        with_ut, with_eval3d, radial_coeffs, tangential_coeffs, thin_prism_coeffs, ftheta_coeffs, rolling_shutter, viewmats_rs: not there.
 
     Returns:
         Images `[..., C, height, width, X]`, alphas `[..., C, height, width, 1]`, and `meta`: batch_ids, camera_ids, gaussian_ids (None unless
         packed), radii, means2d (in the graph: `retain_grad()`), depths, conics, opacities, tile_width, tile_height, tiles_per_gauss, isect_ids,
-        flatten_ids, isect_offsets, width, height, tile_size, n_batches, n_cameras.
+        flatten_ids, isect_offsets, width, height, tile_size, n_batches, n_cameras. With `distributed`, camera_ids count the cameras of all ranks,
+        and the Gaussians are those of this rank, where their gradients arrive.
 
     Raises:
         ValueError, TypeError: naming the argument, what came and what is expected.
-        NotImplementedError: naming the option.
+        NotImplementedError: naming the option; and for the lists of tiles in `meta` (tiles_per_gauss, isect_ids, flatten_ids, isect_offsets)
+            with `distributed`.
     """
-    _reject({"distributed": distributed, "with_ut": with_ut, "with_eval3d": with_eval3d, "radial_coeffs": radial_coeffs,
+    _reject({"with_ut": with_ut, "with_eval3d": with_eval3d, "radial_coeffs": radial_coeffs,
              "tangential_coeffs": tangential_coeffs, "thin_prism_coeffs": thin_prism_coeffs, "ftheta_coeffs": ftheta_coeffs,
              "rolling_shutter": getattr(rolling_shutter, "name", rolling_shutter) != "GLOBAL", "viewmats_rs": viewmats_rs})
     check_choice("render_mode", render_mode, RENDER_MODES)
@@ -117,7 +132,18 @@ def rasterization(means: Tensor, quats: Tensor | None, scales: Tensor | None, op
     if sparse_grad:
         means, covars, quats, scales = (sparse_rows(v, seen) for v in (means, covars, quats, scales))
     antialiased = rasterize_mode == "antialiased"
-    images = math.prod(batch) * C
+    images, own, group = math.prod(batch) * C, C, None
+    if distributed:
+        from tsplat.compat.gsplat import distributed as ranks  # only where it is used: some builds of torch have no torch.distributed
+        if batch or colors.ndim > (2 if sh_degree is None else 3):
+            raise ValueError("distributed: expected no batch dimensions and no colors per camera; "
+                             f"got means of shape {list(means.shape)} and colors of shape {list(colors.shape)}")
+        group, viewmats, Ks = ranks.gather(viewmats, Ks, (means, covars, quats, scales, opacities, colors), {
+            "width": width, "height": height, f"camera_model (of {', '.join(MODELS)})": list(MODELS.values()).index(core_model(camera_model)),
+            "near_plane": near_plane, "far_plane": far_plane, "radius_clip": radius_clip, "eps2d": eps2d,
+            f"render_mode (of {', '.join(RENDER_MODES)})": RENDER_MODES.index(render_mode), "antialiased": antialiased, "absgrad": absgrad,
+            "channels of colors": colors.shape[-1]})
+        C = len(viewmats)                               # of all ranks; Gaussians are those of this one
 
     radii, means2d, depths, conics, compensations = fully_fused_projection(
         means, covars, quats, scales, viewmats, Ks, width, height, eps2d, near_plane, far_plane, radius_clip, calc_compensations=antialiased,
@@ -132,7 +158,7 @@ def rasterization(means: Tensor, quats: Tensor | None, scales: Tensor | None, op
         seen.append(gaussian_ids)
         radii, means2d, depths, conics, view_opacities = (v[visible] for v in (radii, means2d, depths, conics, view_opacities))
         view_colors = None if view_colors is None else view_colors[visible]
-        layout = Packed.of(batch_ids * C + camera_ids, images)
+        layout = Packed.of(batch_ids * C + camera_ids, images) if group is None else None
     channels = [] if view_colors is None else [view_colors]
     if render_mode != "RGB":
         channels.append(depths[..., None])
@@ -140,8 +166,13 @@ def rasterization(means: Tensor, quats: Tensor | None, scales: Tensor | None, op
         backgrounds = torch.nn.functional.pad(backgrounds.reshape(images, -1), (0, int(render_mode != "RGB")))
     color = torch.cat(channels, -1)
 
-    ids, offsets = _bins(means2d, radii, conics, view_opacities, depths, color, images, width, height, layout)
-    image, alpha = draw(means2d, conics, color, view_opacities, backgrounds, ids, offsets, images, width, height, TILE, layout, absgrad)
+    if group is None:
+        ids, offsets = _bins(means2d, radii, conics, view_opacities, depths, color, images, width, height, layout)
+        image, alpha = draw(means2d, conics, color, view_opacities, backgrounds, ids, offsets, images, width, height, TILE, layout, absgrad)
+    else:
+        near = ranks.send_visible(camera_ids, radii, means2d, conics, view_opacities, color, depths, C, absgrad, group)
+        ids, offsets = ops.bin_splats(near.means2d, near.radii, near.conics, near.opacities, near.depths, width, height, TILE)
+        image, alpha = blend(near.means2d, near.conics, near.opacities, near.colors, backgrounds, near.absgrad, ids, offsets, width, height, TILE)
     if "ED" in render_mode:
         image = torch.cat([image[..., :-1], image[..., -1:] / alpha.clamp_min(1e-10)], -1)
 
@@ -149,6 +180,8 @@ def rasterization(means: Tensor, quats: Tensor | None, scales: Tensor | None, op
 
     @functools.cache
     def lists() -> tuple[Tensor, ...]:
+        if group is not None:
+            raise NotImplementedError("meta: tsplat has no lists of tiles with distributed=True; their splats are on other ranks")
         image_ids = None if batch_ids is None or camera_ids is None else batch_ids * C + camera_ids
         return isect_tiles(means2d.detach(), radii, depths.detach(), tile_size, tile_width, tile_height, packed=packed, n_images=images,
                            image_ids=image_ids, gaussian_ids=gaussian_ids)
@@ -161,8 +194,8 @@ def rasterization(means: Tensor, quats: Tensor | None, scales: Tensor | None, op
         "conics": conics, "opacities": view_opacities, "tile_width": tile_width, "tile_height": tile_height,
         "tiles_per_gauss": Deferred(lambda: lists()[0]), "isect_ids": Deferred(lambda: lists()[1]), "flatten_ids": Deferred(lambda: lists()[2]),
         "isect_offsets": Deferred(list_offsets), "width": width, "height": height, "tile_size": tile_size, "n_batches": math.prod(batch),
-        "n_cameras": C})
-    return image.view(*batch, C, *image.shape[1:]), alpha.view(*batch, C, *alpha.shape[1:]), meta
+        "n_cameras": own})
+    return image.view(*batch, own, *image.shape[1:]), alpha.view(*batch, own, *alpha.shape[1:]), meta
 
 
 def _view_colors(means: Tensor, viewmats: Tensor, colors: Tensor, sh_degree: int | None, visible: Tensor, batch: torch.Size) -> Tensor:

@@ -164,7 +164,13 @@ def draw(means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, bac
         probe = torch.zeros_like(m, requires_grad=True)
         probe.register_hook(  # type: ignore[no-untyped-call]
             lambda v: setattr(means2d, "absgrad", v.view_as(means2d) if layout is None else layout.gather(v)))
-    color, alpha = ops.blend(m, c, o, f, backgrounds, probe, ids, offsets, width, height, tile, ALPHA_MAX, True)
+    return blend(m, c, o, f, backgrounds, probe, ids, offsets, width, height, tile)
+
+
+def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, absgrad: Tensor | None, ids: Tensor,
+          offsets: Tensor, width: int, height: int, tile: int) -> tuple[Tensor, Tensor]:
+    """The core's op by gsplat's rules."""
+    color, alpha = ops.blend(means2d, conics, opacities, colors, backgrounds, absgrad, ids, offsets, width, height, tile, ALPHA_MAX, True)
     return color.clone() if color.requires_grad else color, alpha[..., None]
 
 

@@ -1,0 +1,228 @@
+"""`tsplat.rasterize(..., group=...)`: bytes sent per step, scaling on the cores of this machine, and a model of what GPUs would do.
+
+    python bench/distributed.py               # all tables; --quick: small scenes; --json FILE: also the figures
+    python bench/distributed.py --model       # the model alone, which needs no other process
+
+**Bytes.** A step, forward and backward, sends between ranks
+
+    2 v (7 + D) 4 + o,    o = W (W - 1) (2 25 4 C + 8 C + 8 values that are compared)
+
+bytes in all, where v is the number of (camera, visible splat) with the splat on another rank than the camera, each a record of
+means2d (2), conic (3), opacity, depth and D channels in float32 and then its gradient, and o is for cameras and their gradients, counts, and what
+the ranks compare. Measured are the bytes that the collectives are given for other ranks, and what goes over the loopback device, with TCP's
+headers and whatever else uses it.
+
+**Scaling.** Of a row of blocks of 50,000 splats with two cameras of 640x360 each. Splats are dealt out to ranks one by one, so that
+(W - 1) / W of what a camera sees comes from elsewhere. Strong: two blocks on 1 and on 2 processes. Weak: one block on 1 process and two on 2,
+of one thread each. Given are the shortest of 7 steps; CPU time of all processes (median), which other work on the machine changes less; and the
+shortest time in collectives, with waiting for the other rank, in steps that are counted apart. This says what the exchange costs beside rendering
+on a CPU, where rendering is slow and memory is shared; it says nothing of links.
+
+**Model.** One camera of 1920x1080 per rank, N splats, W ranks, V splats visible per camera (a camera in a city sees a part that does not
+grow with the city), SH of degree 3, float32. Per rank and step, without any overlap, in ms, with N and V in millions:
+
+    projection     0.073 N      each rank projects N / W splats into W cameras; kernels, forward and backward [1]
+    passes         0.047 N      torch's elementwise passes over these N, 140 bytes each at 2983 GB/s [1]
+    colours        0.26 V + 0.13 N / W    SH coefficients: 192 bytes, read twice and their gradient added; gradients are made dense
+    exchange       0.27 V       picking, packing and spreading: 20 passes over records of 40 bytes
+    link           80 V (1 / 360 (w - 1) / W + 1 / 40 (W - w) / W)    w = min(W, 8) GPUs in a node; both directions of the step [2]
+    latency        6 (0.03 + 0.001 (W - 1))     header, cameras, counts, records and 2 gradients; an assumption
+    drawing        2.14 V       binning and blending, forward and backward: all other kernels of [1]
+    Adam           0.55 N / W   59 floats, 7 times read or written
+
+[1] bench/results/2026-11-22-h100.md: kernels of 1M random splats, all visible, at 1920x1080, and the copy rate. [2] NVLink 4: 900 GB/s per H100,
+450 in each direction; ConnectX-7: 400 Gb/s per GPU, 50 GB/s (NVIDIA's data sheets of H100 and DGX H100); 80 % of both.
+
+Memory: 59 x 4 numbers per own splat (parameter, gradient, two moments), and 80 bytes (forward) + 40 (backward) for each of N projections.
+
+**The published points.** Grendel (Zhao et al. 2024, abstract): 40.4M splats of Rubble on 16 GPUs, where one GPU held 11.2M. The model puts that at
+the 40M rows. It moves projected splats, too, but divides images into blocks of pixels among ranks, which balances views of different cost; here
+an image is drawn by one rank. RetinaGS (Li et al. 2024, abstract and Figure 1): above 1B splats of MatrixCity on 64 GPUs. It gives each
+rank a convex part of space, and moves partial images: about 16 bytes x pixels x ranks that a view meets, rather than 80 bytes x V. For V = 1M and
+2 Mpixel that is 33 MB per rank met against 80 MB in all: the fewer for views that meet one or two parts. Neither abstract has a time
+per step to compare with. As the 1B rows show, projecting every splat into every camera is what does not scale here: N is not divided by W, as the
+number of cameras grows with it, and 120 bytes times 1B do not fit an H100. Culling before projection, or fewer cameras than ranks, would help;
+neither is there yet.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import json
+import os
+import platform
+import statistics
+import tempfile
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+import torch.distributed as dist
+import torch.multiprocessing as mp
+from scenes import random_scene
+from torch.utils._python_dispatch import TorchDispatchMode
+
+import tsplat
+from tsplat.camera import Camera
+
+COMPARED = 13
+"""Values that the ranks compare."""
+CHANNELS = 3
+CORES = 2
+"""More processes than these are not timed."""
+
+
+class Collectives(TorchDispatchMode):
+    """Bytes given to all-to-alls for other ranks, and seconds in them, with waiting for others."""
+
+    def __init__(self, rank: int) -> None:
+        super().__init__()
+        self.rank, self.bytes, self.seconds = rank, 0, 0.0
+
+    def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        """Run the function and count."""
+        start = time.perf_counter()
+        result = function(*args, **(kwargs or {}))
+        name = function.name()
+        if "all_to_all_single" in name or "wait_tensor" in name:
+            self.seconds += time.perf_counter() - start
+        if "all_to_all_single" in name:
+            rows, _, send = args[:3]
+            self.bytes += (sum(send) - send[self.rank]) * rows.element_size() * (rows[0].numel() if len(rows) else 0)
+        return result
+
+
+def loopback() -> int:
+    """Bytes that this machine has sent to itself over TCP/IP."""
+    lines = Path("/proc/net/dev").read_text().splitlines()
+    return next(int(line.split()[9]) for line in lines if line.strip().startswith("lo:"))
+
+
+def city(blocks: int, splats: int, size: tuple[int, int]) -> tuple[list[torch.Tensor], Camera]:
+    """Blocks side by side, as wide as an image at the middle depth, each of so many splats and with two cameras."""
+    scenes = [random_scene(splats, *size, seed=block) for block in range(blocks)]
+    for block, scene in enumerate(scenes):
+        scene.means[:, 0] += 6 * block
+    viewmats = torch.eye(4).repeat(2 * blocks, 1, 1)
+    viewmats[:, 0, 3] = -6 * (torch.arange(2 * blocks) // 2) + torch.tensor([0.7, -0.7]).repeat(blocks)
+    camera = Camera(viewmats, scenes[0].camera.Ks.repeat(2 * blocks, 1, 1), *size)
+    return [torch.cat(values) for values in zip(*(scene[:5] for scene in scenes), strict=True)], camera
+
+
+def work(rank: int, ranks: int, folder: str, blocks: int, splats: int, size: tuple[int, int], threads: int, times: int) -> None:
+    """Steps of one process: every so-manieth splat of a city, wherever it is, and its part of the cameras."""
+    torch.set_num_threads(threads)
+    dist.init_process_group("gloo", init_method=f"file://{folder}/store", rank=rank, world_size=ranks, timeout=datetime.timedelta(seconds=300))
+    scene, cameras = city(blocks, splats, size)
+    own = len(cameras) // ranks
+    camera = cameras[rank * own:(rank + 1) * own]
+    leaves = [v[rank::ranks].clone().requires_grad_() for v in scene]
+    weights = torch.randn(own, *reversed(size), 3, generator=torch.Generator().manual_seed(rank))
+
+    def step() -> tsplat.Meta:
+        poses = camera.viewmats.clone().requires_grad_()
+        rendering = tsplat.rasterize(*leaves, replace(camera, viewmats=poses), group=dist.group.WORLD)
+        torch.autograd.grad((rendering.image * weights).sum(), [*leaves, poses])
+        return rendering.meta
+
+    visible = step().visible.view(ranks, -1)
+    elsewhere = visible.sum(1).tolist()
+    counter = Collectives(rank)
+    dist.barrier()
+    before = loopback()
+    with counter:
+        step()
+    dist.barrier()
+    sent = loopback() - before
+    seconds, cpu, waiting = [], [], []
+    for _ in range(times):
+        dist.barrier()
+        start, cpu_start = time.perf_counter(), time.process_time()
+        step()
+        cpu.append(time.process_time() - cpu_start)
+        dist.barrier()                                                                      # the slowest rank's time
+        seconds.append(time.perf_counter() - start)
+        with Collectives(rank) as timer:
+            step()
+        waiting.append(timer.seconds)
+    found = {"elsewhere": sum(elsewhere) - elsewhere[rank], "visible": sum(elsewhere), "bytes": counter.bytes, "loopback": sent,
+             "seconds": min(seconds), "cpu": statistics.median(cpu), "collectives": min(waiting)}
+    Path(folder, f"{rank}.json").write_text(json.dumps(found))
+    dist.barrier()
+    dist.destroy_process_group()
+
+
+def measure(ranks: int, blocks: int, splats: int, size: tuple[int, int], threads: int, times: int) -> dict[str, Any]:
+    """Start the processes and join what they found."""
+    with tempfile.TemporaryDirectory() as folder:
+        mp.spawn(work, args=(ranks, folder, blocks, splats, size, threads, times), nprocs=ranks)
+        found = [json.loads(Path(folder, f"{rank}.json").read_text()) for rank in range(ranks)]
+    cameras = 2 * blocks
+    own = cameras // ranks
+    overhead = ranks * (ranks - 1) * (2 * 25 * 4 * own + 8 * own + 8 * COMPARED)
+    total = {key: sum(f[key] for f in found) for key in ("elsewhere", "visible", "bytes")}
+    return {"ranks": ranks, "threads": threads, "splats": blocks * splats, "cameras": cameras, "size": f"{size[0]}x{size[1]}", **total,
+            "formula": 2 * total["elsewhere"] * (7 + CHANNELS) * 4 + overhead * (ranks > 1), "loopback": found[0]["loopback"] * (ranks > 1),
+            "ms": 1e3 * max(f["seconds"] for f in found), "cpu_ms": 1e3 * sum(f["cpu"] for f in found),
+            "collectives_ms": 1e3 * min(f["collectives"] for f in found)}
+
+
+def predict(splats: float, ranks: int, visible: float) -> dict[str, float]:
+    """The model of the docstring; splats and visible in millions."""
+    N, V, W, node = splats, visible, ranks, min(ranks, 8)
+    parts = {"projection and passes": 0.120 * N, "colours": 0.26 * V + 0.13 * N / W, "exchange": 0.27 * V * (W > 1),
+             "link": 80 * V * ((node - 1) / W / 360 + (W - node) / W / 40), "latency": 6 * (0.03 + 0.001 * (W - 1)) * (W > 1),
+             "drawing": 2.14 * V, "Adam": 0.55 * N / W}
+    total = sum(parts.values())
+    return {"splats": N, "ranks": W, "visible": V, **parts, "ms": total, "images_per_s": 1e3 * W / total,
+            "GB": 1e-3 * (59 * 4 * 4 * N / W + 120 * N)}
+
+
+def header(*names: str) -> None:
+    print(f"| {' | '.join(names)} |\n|{' --- |' * len(names)}")
+
+
+def print_model() -> list[dict[str, float]]:
+    rows = [predict(n, w, v) for n, ranks in ((40, (1, 8, 16, 64)), (1000, (64, 256, 1024))) for w in ranks for v in (1.0, 4.0)]
+    header("splats (M)", "ranks", "visible (M)", "projection, passes", "colours", "exchange", "link", "latency", "drawing", "Adam", "ms per step",
+           "images/s", "GB per rank")
+    for r in rows:
+        values = list(r.values())
+        print(f"| {values[0]:g} | {values[1]:g} | {values[2]:g} | " + " | ".join(f"{v:.2f}" for v in values[3:10]) +
+              f" | **{r['ms']:.1f}** | {r['images_per_s']:.0f} | {r['GB']:.1f} |")
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="small scenes")
+    parser.add_argument("--model", action="store_true", help="only the model")
+    parser.add_argument("--json", type=Path, help="also write the results here")
+    args = parser.parse_args()
+    rows: list[dict[str, Any]] = []
+    if not args.model:
+        n, size, times = (2_000, (160, 90), 2) if args.quick else (50_000, (640, 360), 7)
+        cases = [(1, 1, 1), (1, 2, 1), (1, 2, 2), (2, 2, 1), (3, 3, 1), (4, 4, 1)]
+        print(f"torch {torch.__version__}, {platform.machine()}, {size[0]}x{size[1]}, RGB, gloo\n")
+        header("processes", "threads of each", "splats", "cameras", "seen", "seen elsewhere", "bytes sent", "formula", "loopback", "ms", "CPU ms",
+               "in collectives")
+        for ranks, blocks, threads in cases:
+            timed = ranks <= CORES
+            r = measure(ranks, blocks, n, size, threads, times if timed else 1)
+            rows.append(r)
+            timing = f"{r['ms']:.0f} | {r['cpu_ms']:.0f} | {r['collectives_ms']:.0f}" if timed else "- | - | -"
+            sizes = " | ".join(f"{r[key]:,}" for key in ("splats", "cameras", "visible", "elsewhere", "bytes", "formula", "loopback"))
+            print(f"| {ranks} | {threads} | {sizes} | {timing} |", flush=True)
+        print()
+    model = print_model()
+    if args.json:
+        machine = f"{platform.machine()}, {os.cpu_count()} cores"
+        found = {"torch": torch.__version__, "machine": machine, "date": str(datetime.date.today()), "rows": rows, "model": model}
+        args.json.write_text(json.dumps(found, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

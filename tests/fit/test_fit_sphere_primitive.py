@@ -13,6 +13,7 @@ from tsplat.cli import main
 from tsplat.fit import FitConfig, fit
 from tsplat.fit.optimiser import make_adam
 from tsplat.fit.sphere_primitive import PruneAndRefine, SpherePrimitive
+from tsplat.fit.trainer import start, train_step
 from tsplat.scene import Capture, load_scene
 
 CONFIG = FitConfig(primitive="spheres", steps=24, splats=60, max_splats=300, checkpoint_every=5, background="white")
@@ -124,6 +125,18 @@ def test_commands(capture: Capture, tmp_path: Path, capsys: pytest.CaptureFixtur
     path = tmp_path / "s.ply"
     SpherePrimitive().start(capture, CONFIG, torch.Generator().manual_seed(0)).save(path)
     assert main(["info", str(path)]) == 0
-    assert "spheres  200, 3 channels, gamma 0.003" in capsys.readouterr().out
+    assert "spheres  200, 3 channels, gamma 0.01" in capsys.readouterr().out
     assert main(["render", str(path), "-o", str(tmp_path / "out.png"), "--size", "32x24"]) == 0
     assert (tmp_path / "out.png").is_file()
+
+
+def test_colours_stay_in_range(capture: Capture) -> None:
+    config = dataclasses.replace(CONFIG, density="none")
+    state = start(capture, config, torch.device("cpu"))
+    with torch.no_grad():
+        state.gaussians.features[:3] = torch.tensor([[-1.0, 0.5, 2.0]])
+    train_step(state, capture, config)
+    features = state.gaussians.features
+    assert (features[:3, 0] == 0).all()
+    assert (features[:3, 2] == 1).all()
+    assert ((features >= 0) & (features <= 1)).all()

@@ -83,7 +83,7 @@ class FitConfig:
     lr_poses: float = field(default=1e-4, metadata=_about(CAMERAS, "first learning rate of poses: radians, and shifts per extent of the scene", 0))
     pose_steps: int = field(default=50, metadata=_about(CAMERAS, "steps in which the pose of each held-out photo is refined", 0))
     gamma_first: float = field(default=0.1, metadata=_about(SPHERES, "spheres: gamma at the first step, soft", 1e-5, 1))
-    gamma_last: float = field(default=3e-3, metadata=_about(SPHERES, "spheres: gamma at the last step, hard; log-linear in between", 1e-5, 1))
+    gamma_last: float = field(default=1e-2, metadata=_about(SPHERES, "spheres: gamma at the last step, hard; log-linear in between", 1e-5, 1))
     fade_below: float = field(default=1.0, metadata=_about(SPHERES,
         "spheres: their positions and radii move less if their radius is below this many pixels, where gradients are noise", 0))
     optimiser: Optimiser = field(default="adam", metadata=_about(RATES,

@@ -48,6 +48,10 @@ class Primitive(Protocol):
         """The learning rate of each parameter, by name."""
         ...
 
+    def confine(self, scene: Scene) -> None:
+        """Bring back what a step has moved out of its range."""
+        ...
+
     def control(self, config: FitConfig, extent: float, splats: int) -> Control:
         """Density control of a scene that starts with that many splats."""
         ...
@@ -78,6 +82,9 @@ class GaussianPrimitive:
     def rates(self, config: FitConfig, extent: float, step: int) -> dict[str, float]:
         """See `learning_rates`."""
         return learning_rates(config, extent, step)
+
+    def confine(self, scene: Scene) -> None:
+        """All parameters are unbounded."""
 
     def control(self, config: FitConfig, extent: float, splats: int) -> Control:
         """The kind that the config names."""

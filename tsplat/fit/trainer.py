@@ -194,6 +194,7 @@ def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStr
     state.control.observe(rendering.meta, camera)
     set_rates(state.adam, primitive.rates(config, extent, state.step))
     adam_step(state.adam, rendering.meta.visible.any(0))
+    primitive.confine(scene)
     state.photos.step(view, config, state.step)
     state.step += 1
     quality = float(psnr(rendering.image.detach(), target))

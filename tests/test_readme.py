@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -102,9 +103,30 @@ def test_conventions() -> None:
     torch.testing.assert_close(pixel(camera), torch.tensor([32.0, 24.0]) - 24 * ndc)
 
 
+def test_many_gpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a CPU, as one process: what it says, with gloo for nccl."""
+    if not torch.distributed.is_available():
+        pytest.skip("torch was built without torch.distributed")
+    begin = torch.distributed.init_process_group
+    store = torch.distributed.FileStore(str(tmp_path / "store"), 1)
+    monkeypatch.setenv("LOCAL_RANK", "0")
+    monkeypatch.setattr(torch.cuda, "set_device", lambda device: None)
+    monkeypatch.setattr(torch.distributed, "init_process_group", lambda backend: begin("gloo", store=store, rank=0, world_size=1))
+    scene = tsplat.Gaussians.from_points(torch.randn(20, 3) * 0.3, torch.rand(20, 3), 3)
+    camera = tsplat.Camera.look_at((0, -1, -3), (0, 0, 0), fov=50, **SIZE)
+    [code] = section("Many GPUs")
+    try:
+        run(code, os=os, means=scene.means, quats=scene.quats, scales=scene.scales, opacities=scene.opacities, sh=scene.sh, camera=camera,
+            loss=torch.mean)
+    finally:
+        torch.distributed.destroy_process_group()
+    assert scene.means.grad is not None
+    assert (scene.means.grad != 0).any()
+
+
 def test_no_code_is_left_out() -> None:
     """The sections above, and that of the peers, whose code tests/compat runs."""
-    tested = ["Render a scene", "Spheres: Pulsar", "Conventions", "Coming from gsplat, Inria or Pulsar"]
+    tested = ["Render a scene", "Spheres: Pulsar", "Many GPUs", "Conventions", "Coming from gsplat, Inria or Pulsar"]
     assert sum(len(section(title)) for title in tested) == README.count("```python")
 
 

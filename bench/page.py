@@ -1,0 +1,130 @@
+"""The benchmark page: one table for each JSON document in `bench/results`, newest first, with device, versions, commit, date and command.
+
+python bench/page.py              # writes bench/results/README.md
+python bench/page.py --check      # only says whether it is as this would write it
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+RESULTS = Path(__file__).resolve().parent / "results"
+Row = dict[str, Any]
+Columns = dict[str, Callable[[Row], str]]
+
+HEAD = """# What was measured
+
+This page is made by `python bench/page.py` from the JSON files beside it, which the scripts in `bench` wrote (`--json`). What each measures, and how,
+stands at the head of the script. Times on different machines do not compare, ratios in a row do: both sides ran in one process, or are scaled as
+the script says.
+"""
+
+
+def mean(values: Iterable[float]) -> float:
+    numbers = list(values)
+    return sum(numbers) / len(numbers)
+
+
+def spread(fits: list[Row], key: str, digits: int) -> str:
+    """Mean of all seeds, and their range."""
+    values = [fit[key] for fit in fits]
+    text = f"{mean(values):.{digits}f}"
+    return text if len(values) == 1 else f"{text} ({min(values):.{digits}f} to {max(values):.{digits}f})"
+
+
+GPU: Columns = {
+    "scene": lambda r: r["scene"],
+    "channels": lambda r: str(r["channels"]),
+    "forward ms": lambda r: f"{r['ms']['forward'][0]:.2f}",
+    "fwd+bwd ms": lambda r: f"{r['ms']['both'][0]:.2f}",
+    "MiB": lambda r: f"{r['peak_MiB']:.0f}",
+    "gsplat's forward": lambda r: f"{r['gsplat']['forward'][0]:.2f}",
+    "fwd+bwd": lambda r: f"{r['gsplat']['both'][0]:.2f}",
+    "times as fast": lambda r: f"{r['gsplat']['both'][0] / r['ms']['both'][0]:.2f}",
+}
+CPU: Columns = {
+    "size": lambda r: f"{r['width']}x{r['height']}",
+    "splats": lambda r: f"{r['n']:,}",
+    "forward ms": lambda r: f"{r['forward_ms']:.0f}",
+    "fwd+bwd ms": lambda r: f"{r['both_ms']:.0f}",
+    "rival's, scaled": lambda r: " / ".join(f"{ms:.0f}" for ms in r["rival_ms"]),
+    "ours over rival's": lambda r: f"{r['forward_ms'] / r['rival_ms'][0]:.2f} / {r['both_ms'] / r['rival_ms'][1]:.2f}",
+}
+SPHERES: Columns = {
+    "set-up": lambda r: r["part"],
+    "spheres": lambda r: f"{r['spheres']:,}",
+    "size": lambda r: f"{r['width']}x{r['height']}",
+    "may leave out": lambda r: f"{r['tolerance']:g}",
+    "forward s": lambda r: f"{r['forward']['wall']:.3g}",
+    "backward s": lambda r: f"{r['backward']['wall']:.3g}",
+    "MiB": lambda r: f"{r['both_MiB']:.0f}",
+}
+QUALITY: Columns = {
+    "capture": lambda r: r["capture"],
+    "options": lambda r: ", ".join(f"{key} {value}" for key, value in r["config"].items()),
+    "seeds": lambda r: str(len(r["fits"])),
+    "PSNR dB": lambda r: spread(r["fits"], "psnr", 2),
+    "SSIM": lambda r: spread(r["fits"], "ssim", 4),
+    "splats": lambda r: f"{mean(fit['splats'] for fit in r['fits']):,.0f}",
+    "wall s": lambda r: spread(r["fits"], "wall_s", 0),
+    "CPU s": lambda r: spread(r["fits"], "cpu_s", 0),
+}
+DISTRIBUTED: Columns = {
+    "processes": lambda r: str(r["ranks"]),
+    "threads of each": lambda r: str(r["threads"]),
+    "splats": lambda r: f"{r['splats']:,}",
+    "cameras": lambda r: str(r["cameras"]),
+    "bytes sent": lambda r: f"{r['bytes']:,}",
+    "formula": lambda r: f"{r['formula']:,}",
+}
+
+
+def sections(report: Row) -> list[tuple[str, Columns, list[Row]]]:
+    """Title, columns and rows of what a document has."""
+    if "fits" in report:
+        return [("Quality of fits, held-out photos", QUALITY, [report])]
+    if "runs" in report:                                  # several commits on one machine
+        return [part for run in report["runs"] for part in sections(run)]
+    rows = [row for row in report.get("rows", []) if "error" not in row]
+    kinds = (("gsplat", "Gaussians on a GPU, beside gsplat", GPU), ("rival_ms", "Gaussians on a CPU", CPU), ("part", "Spheres", SPHERES),
+             ("ranks", "Many processes", DISTRIBUTED))
+    return [(title + (f", commit {report['commit']}" if "commit" in report else ""), columns, rows)
+            for key, title, columns in kinds if rows and key in rows[0]]
+
+
+def table(columns: Columns, rows: list[Row]) -> list[str]:
+    lines = ["| " + " | ".join(columns) + " |", "| --- " * len(columns) + "|"]
+    return lines + ["| " + " | ".join(value(row) for value in columns.values()) + " |" for row in rows]
+
+
+def page(folder: Path) -> str:
+    """The text, of all documents in the folder."""
+    lines = [HEAD]
+    for path in sorted(folder.glob("*.json"), reverse=True):
+        report = json.loads(path.read_text(encoding="utf-8"))
+        for title, columns, rows in sections(report):
+            versions = [f"{key} {report[key]}" for key in ("torch", "triton", "gsplat", "threads") if key in report]
+            lines += [f"## {title}", "", f"{report.get('machine') or report['device']}, {report['date']}, {', '.join(versions)}"
+                      + (f": `{report['command']}`" if "command" in report else "") + f" ([{path.name}]({path.name}))", "", *table(columns, rows), ""]
+    lines += ["## In words", "", "What else was measured, and what was tried: " + ", ".join(
+        f"[{path.stem}]({path.name})" for path in sorted(folder.glob("2*.md"), reverse=True)) + ".", ""]
+    return "\n".join(lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing; exit with 1 if the page would change")
+    check, file, text = parser.parse_args().check, RESULTS / "README.md", page(RESULTS)
+    if check:
+        return int(not file.is_file() or file.read_text(encoding="utf-8") != text)
+    file.write_text(text, encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

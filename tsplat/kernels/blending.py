@@ -17,6 +17,7 @@ from tsplat.kernels.feature_blending import feature_bwd_kernel, feature_colors_b
 from tsplat.kernels.footprint import LOG2_MIN, SUMS, T_MIN, TILE
 from tsplat.kernels.launch import Launcher, ceil_div, current_target, launch
 from tsplat.kernels.tiles import (
+    add_tile_sums,
     block_pixels,
     blocks,
     glue,
@@ -32,7 +33,6 @@ from tsplat.kernels.tiles import (
     row_moments,
     store_channels,
     tile_list,
-    tile_sums,
 )
 
 CHANNELS = 4
@@ -244,16 +244,8 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
                 ax = tl.sum(tl.abs(v * slope_x), 1, keep_dims=True)
                 ay = tl.sum(tl.abs(v * slope_y), 1, keep_dims=True)
             COUNT: tl.constexpr = 12 if ABSGRAD or D > 3 else 9
-            first, slot, second, second_slot, has_second = tile_sums(s0, sx, sy, sxx, sxy, syy, w0, w1, w2, w3, ax, ay, COUNT, PTX)
-            real = splat != null
-            if PER_HIT:
-                q = sums + (start + i + u) * SUMS
-                tl.store(q + slot, first, mask=real)
-                tl.store(q + second_slot, second, mask=real & has_second)
-            else:
-                q = sums + splat.to(tl.int64) * SUMS
-                tl.atomic_add(q + slot, first, mask=real, sem="relaxed")
-                tl.atomic_add(q + second_slot, second, mask=real & has_second, sem="relaxed")
+            row = start + i + u if PER_HIT else splat.to(tl.int64)
+            add_tile_sums(sums + row * SUMS, s0, sx, sy, sxx, sxy, syy, w0, w1, w2, w3, ax, ay, splat != null, COUNT, PER_HIT, PTX)
             u += 1
         i += TILE
         batch = following

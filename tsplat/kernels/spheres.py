@@ -31,6 +31,7 @@ from tsplat.kernels.sphere_geometry import (
 from tsplat.kernels.sphere_outlines import outlines as outlines
 from tsplat.kernels.sphere_tracking import nearest_hits as nearest_hits
 from tsplat.kernels.tiles import (
+    add_tile_sums,
     block_pixels,
     blocks,
     glue,
@@ -45,7 +46,6 @@ from tsplat.kernels.tiles import (
     store_channels,
     tile_list,
     tile_min,
-    tile_sums,
 )
 
 
@@ -214,15 +214,8 @@ def sphere_bwd_kernel(records, ids, offsets, used, gamma, Ks, cutoff, logsumexp,
             c2 = o * row_dot(weight, v2) if D > 2 else none
             c3 = o * row_dot(weight, v3) if D > 3 else none
             COUNT: tl.constexpr = 12 if D > 3 else 9
-            first, slot, second, second_slot, has_second = tile_sums(s0, s1, s2, s3, s4, s5, c0, c1, c2, c3, none, none, COUNT, PTX)
-            if PER_HIT:
-                q = sums + (start + i + u) * SUMS
-                tl.store(q + slot, first, mask=real)
-                tl.store(q + second_slot, second, mask=real & has_second)
-            else:
-                q = sums + index.to(tl.int64) * SUMS
-                tl.atomic_add(q + slot, first, mask=real, sem="relaxed")
-                tl.atomic_add(q + second_slot, second, mask=real & has_second, sem="relaxed")
+            row = start + i + u if PER_HIT else index.to(tl.int64)
+            add_tile_sums(sums + row * SUMS, s0, s1, s2, s3, s4, s5, c0, c1, c2, c3, none, none, real, COUNT, PER_HIT, PTX)
             u += 1
         i += TILE
         batch = following

@@ -237,6 +237,18 @@ def tile_sums(s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, COUNT: tl.conste
 
 
 @triton.jit
+def add_tile_sums(p, s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, real, COUNT: tl.constexpr, PER_HIT: tl.constexpr, PTX: tl.constexpr):
+    """Add `tile_sums` to those at p of each tile, where `real`; or store them, if each tile and splat has a place of its own (PER_HIT)."""
+    first, slot, second, second_slot, has_second = tile_sums(s0, s1, s2, s3, s4, s5, s6, s7, s8, s9, s10, s11, COUNT, PTX)
+    if PER_HIT:
+        tl.store(p + slot, first, mask=real)
+        tl.store(p + second_slot, second, mask=real & has_second)
+    else:
+        tl.atomic_add(p + slot, first, mask=real, sem="relaxed")
+        tl.atomic_add(p + second_slot, second, mask=real & has_second, sem="relaxed")
+
+
+@triton.jit
 def tile_min(v):
     """Least of the lanes of each tile, in every lane of it (portable)."""
     groups: tl.constexpr = v.shape[0] // TILE

@@ -148,6 +148,23 @@ def contiguous(function: Callable[..., tuple[Tensor, ...]]) -> Callable[..., Any
     return functools.wraps(function)(call)
 
 
+def rows_of(mask: Tensor, *gradients: Tensor | None) -> Tensor | None:
+    """The rows n, int64, of pairs in `mask`, bool `[C, N]`, with any gradient `[C, N]` or `[C, N, D]` that is not 0; None if those are all.
+
+    With these alone, a stage on a CPU spends nothing on splats that are not seen, and gives the others the same bits however many there
+    are: products of matrices and sums over splats are rounded in another way with another number of rows.
+    """
+    given = [((v if v.ndim > 2 else v[..., None]) != 0).any(-1) for v in gradients if v is not None]
+    seen = (mask & functools.reduce(torch.logical_or, given) if given else mask).any(0)
+    return None if bool(seen.all()) else seen.nonzero()[:, 0]
+
+
+def spread(values: Tensor, rows: Tensor, n: int, dim: int = 0) -> Tensor:
+    """`values` as `rows` of n along `dim`, the others 0."""
+    shape = (*values.shape[:dim], n, *values.shape[dim + 1:])
+    return values.new_zeros(shape).index_copy_(dim, rows, values)
+
+
 def _looped(op: Callable[..., Any]) -> Callable[..., tuple[Any, Any]]:
     def rule(info: Any, in_dims: tuple[int | None, ...], *args: Any) -> tuple[Any, Any]:
         results = [op(*(a if d is None else a.select(d, i) for a, d in zip(args, in_dims, strict=True))) for i in range(info.batch_size)]

@@ -6,12 +6,14 @@ import contextlib
 import functools
 import importlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 from torch.library import custom_op
+
+Optional = TypeVar("Optional", Tensor, Tensor | None)
 
 PLAIN = frozenset((Tensor, torch.nn.Parameter))
 """Tensors that have no `__torch_dispatch__` or `__torch_function__` of their own."""
@@ -159,10 +161,16 @@ def rows_of(mask: Tensor, *gradients: Tensor | None) -> Tensor | None:
     return None if bool(seen.all()) else seen.nonzero()[:, 0]
 
 
-def spread(values: Tensor, rows: Tensor, n: int, dim: int = 0) -> Tensor:
-    """`values` as `rows` of n along `dim`, the others 0."""
-    shape = (*values.shape[:dim], n, *values.shape[dim + 1:])
-    return values.new_zeros(shape).index_copy_(dim, rows, values)
+def at(values: Optional, rows: Tensor | None, dim: int = 0) -> Optional:
+    """`values` at `rows` along `dim`, as they are if either is None."""
+    return values if values is None or rows is None else values.index_select(dim, rows)
+
+
+def spread(values: Optional, rows: Tensor | None, n: int, dim: int = 0) -> Optional:
+    """The inverse of `at`: `values` as `rows` of n along `dim`, the others 0."""
+    if values is None or rows is None:
+        return values
+    return values.new_zeros(*values.shape[:dim], n, *values.shape[dim + 1:]).index_copy_(dim, rows, values)
 
 
 def _looped(op: Callable[..., Any]) -> Callable[..., tuple[Any, Any]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -10,7 +9,7 @@ import tsplat_reference as reference
 from torch import Tensor
 from tsplat_reference import Projection
 
-from tsplat.ops.common import Op, contiguous, rows_of, run_kernel, second_derivative, spread
+from tsplat.ops.common import Op, at, contiguous, rows_of, run_kernel, second_derivative, spread
 
 Five = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -52,18 +51,14 @@ def _project_backward_cpu(means: Tensor, quats: Tensor | None, scales: Tensor | 
                           viewmats: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float,
                           antialiased: bool, radii: Tensor, v_means2d: Tensor, v_depths: Tensor | None, v_conics: Tensor,
                           v_compensations: Tensor | None, cameras: bool = True) -> Six:
-    splats: list[Any] = [means, quats, scales, covars]
-    pairs: list[Any] = [radii, v_means2d, v_depths, v_conics, v_compensations]
-    rows = rows_of(radii[..., 0] > 0, *pairs[1:])
-    if rows is not None:
-        splats, pairs = [None if x is None else x[rows] for x in splats], [None if x is None else x[:, rows] for x in pairs]
-    results: list[Any] = list(reference.project_backward(*splats, viewmats, Ks, width, height, model, eps2d, antialiased, *pairs, cameras))
-    if rows is not None:
-        results[:4] = [None if x is None else spread(x, rows, len(means)) for x in results[:4]]
-    return _some_empty(means, results)
+    rows = rows_of(radii[..., 0] > 0, v_means2d, v_depths, v_conics, v_compensations)
+    results = reference.project_backward(
+        at(means, rows), at(quats, rows), at(scales, rows), at(covars, rows), viewmats, Ks, width, height, model, eps2d, antialiased,
+        at(radii, rows, 1), at(v_means2d, rows, 1), at(v_depths, rows, 1), at(v_conics, rows, 1), at(v_compensations, rows, 1), cameras)
+    return _some_empty(means, (*(spread(v, rows, len(means)) for v in results[:4]), *results[4:]))
 
 
-def _some_empty(means: Tensor, results: Sequence[Tensor | None]) -> Six:
+def _some_empty(means: Tensor, results: tuple[Tensor | None, ...]) -> Six:
     """An op returns tensors only."""
     return tuple(means.new_empty(0) if r is None else r for r in results)  # type: ignore[return-value]
 

@@ -31,6 +31,7 @@ class FitState:
         generator: the source of all that is random (on the CPU, whatever the device).
         device: where a step is computed, and `photos` are; not always where the scene is (`FitConfig.offload`).
         step: steps done.
+        drawn: the most splats that one of them drew, since the fit was last started.
         queue: photos yet to come before all are shuffled anew, last first.
         seconds: wall time spent so far.
         history: of loss, PSNR and splats.
@@ -43,6 +44,7 @@ class FitState:
     generator: torch.Generator
     device: torch.device
     step: int = 0
+    drawn: int = 0
     queue: list[int] = field(default_factory=list)
     seconds: float = 0.0
     history: History = field(default_factory=History)

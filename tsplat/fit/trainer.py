@@ -187,10 +187,12 @@ def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStr
     state.photos.zero_grad()
     loss.backward()                                       # type: ignore[no-untyped-call]
     _check_finite(float(loss.detach()), [scene, state.photos], f"step {state.step + 1}, photo {capture.names[view]}")
-    check_growth(scene, state.control.growth(scene, state.step + 1), state.step + 1)
+    seen = rendering.meta.visible.any(0)
+    state.drawn = max(state.drawn, int(seen.sum()))
+    check_growth(scene, state.control.growth(scene, state.step + 1), state.step + 1, rendering.image.device, state.drawn)
     state.control.observe(rendering.meta, camera)
     set_rates(state.adam, primitive.rates(config, extent, state.step))
-    adam_step(state.adam, rendering.meta.visible.any(0))
+    adam_step(state.adam, seen)
     state.photos.step(view, config, state.step)
     state.step += 1
     quality = float(psnr(rendering.image.detach(), target))

@@ -65,7 +65,7 @@ class _Take(torch.autograd.Function):
     def forward(ctx: Any, values: Tensor, rows: Tensor, dim: int, device: torch.device) -> Tensor:
         ctx.save_for_backward(rows)
         ctx.dim, ctx.n, ctx.home = dim, values.shape[dim], values.device
-        staging = _host_memory((*values.shape[:dim], len(rows), *values.shape[dim + 1:]), values.dtype, device)
+        staging = _staging((*values.shape[:dim], len(rows), *values.shape[dim + 1:]), values.dtype, values.device, device)
         torch.index_select(values, dim, rows, out=staging)
         return staging.to(device, non_blocking=True)             # torch keeps pinned memory from being reused before the copy is done
 
@@ -74,10 +74,10 @@ class _Take(torch.autograd.Function):
     def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:
         (rows,) = ctx.saved_tensors
         if gradient.device != ctx.home:
-            gradient = _host_memory(gradient.shape, gradient.dtype, gradient.device).copy_(gradient)
+            gradient = _staging(gradient.shape, gradient.dtype, ctx.home, gradient.device).copy_(gradient)
         return spread(gradient, rows, ctx.n, ctx.dim), None, None, None
 
 
-def _host_memory(shape: tuple[int, ...], dtype: torch.dtype, device: torch.device) -> Tensor:
-    """For a copy to or from `device`."""
-    return torch.empty(shape, dtype=dtype, pin_memory=device.type == "cuda")
+def _staging(shape: tuple[int, ...], dtype: torch.dtype, home: torch.device, device: torch.device) -> Tensor:
+    """At `home`, for a copy to or from `device`."""
+    return torch.empty(shape, dtype=dtype, device=home, pin_memory=home.type == "cpu" and device.type == "cuda")

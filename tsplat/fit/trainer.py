@@ -93,7 +93,7 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
             machine, with the same bits as one that was not.
         progress: show a line with loss, PSNR and number of splats.
         callbacks: each is called after each step; `tsplat.fit.to_writer` makes one for TensorBoard.
-        device: where to compute.
+        device: where to compute. (The scene is in host memory with `config.offload`, else there.)
 
     Raises:
         ValueError, FileNotFoundError: bad data, no photo to train on, a checkpoint of another fit.

@@ -11,7 +11,7 @@ from tsplat_reference.parallel import map_chunks
 
 from tsplat.camera import Camera
 
-CHUNK = 1 << 15
+CHUNK = 1 << 15       # splats asked at a time, so that what is computed of them stays in the cache
 ROUNDING = 32         # errors of eps/2 that a coordinate, here and in the projection, can have at most, with room
 SLACK = 1e-4          # relative, of sizes and opacities
 

@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.library import custom_op
 
-Optional = TypeVar("Optional", Tensor, Tensor | None)
+Maybe = TypeVar("Maybe", Tensor, Tensor | None)
 
 PLAIN = frozenset((Tensor, torch.nn.Parameter))
 """Tensors that have no `__torch_dispatch__` or `__torch_function__` of their own."""
@@ -161,12 +161,12 @@ def rows_of(mask: Tensor, *gradients: Tensor | None) -> Tensor | None:
     return None if bool(seen.all()) else seen.nonzero()[:, 0]
 
 
-def at(values: Optional, rows: Tensor | None, dim: int = 0) -> Optional:
+def at(values: Maybe, rows: Tensor | None, dim: int = 0) -> Maybe:
     """`values` at `rows` along `dim`, as they are if either is None."""
     return values if values is None or rows is None else values.index_select(dim, rows)
 
 
-def spread(values: Optional, rows: Tensor | None, n: int, dim: int = 0) -> Optional:
+def spread(values: Maybe, rows: Tensor | None, n: int, dim: int = 0) -> Maybe:
     """The inverse of `at`: `values` as `rows` of n along `dim`, the others 0."""
     if values is None or rows is None:
         return values

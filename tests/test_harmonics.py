@@ -64,6 +64,7 @@ def test_values_and_gradients_match_the_definition(backend: Backend, degree: int
 @pytest.mark.parametrize("degree", DEGREES)
 def test_closed_form_backward_is_autograd_of_the_formula(degree: int) -> None:
     *inputs, mask = scene(degree)
+    mask[0] |= ~mask[1]             # those that neither sees are left out, and another number of rows has another rounding
     inputs = leaves(*inputs)
     got, formula = ops.harmonics(*inputs, degree, mask), reference.harmonics(*inputs, degree, mask)
     assert_same_bits([got], [formula])

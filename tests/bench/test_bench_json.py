@@ -16,7 +16,7 @@ torch.cuda.is_available = lambda: True
 def measured(*arguments, **options):
     print("| a table |")
     return {"rows": [1.5]}
-for name, options in (("cpu", ["--quick"]), ("spheres", ["--no-figure", "--device", "cpu"]), ("gpu", [])):
+for name, options in (("cpu", ["--quick"]), ("spheres", ["--no-figure", "--device", "cpu"]), ("gpu", []), ("offload", [])):
     module = __import__(name)
     module.measure_all = measured                       # the measurements themselves take minutes, and a GPU
     out, sys.argv = io.StringIO(), [name, "--json", *options]
@@ -29,7 +29,7 @@ for name, options in (("cpu", ["--quick"]), ("spheres", ["--no-figure", "--devic
 def test_speed() -> None:
     done = subprocess.run([sys.executable, "-c", SPEED], env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    assert done.stderr == "| a table |\n" * 3
+    assert done.stderr == "| a table |\n" * 4
 
 
 def test_quality(tmp_path: Path) -> None:
@@ -41,3 +41,13 @@ def test_quality(tmp_path: Path) -> None:
     assert report["capture"] == "fox"
     assert [fit["seed"] for fit in report["fits"]] == [0, 1]
     assert [line.partition(":")[0] for line in done.stderr.splitlines()] == ["fox seed 0", "fox seed 1"]
+
+
+def test_offload_moves_what_the_formula_says() -> None:
+    done = subprocess.run([sys.executable, BENCH / "offload.py", "--splats", "3000", "--json"], env=ENVIRONMENT, capture_output=True, text=True,
+                          timeout=120)
+    assert done.returncode == 0, done.stderr
+    for row in json.loads(done.stdout)["rows"]:
+        assert 0 < row["with"]["taken"] < 0.1 * row["splats"]
+        for way in ("down", "up"):
+            assert row["with"][f"{way}_MiB"] == row["with"][f"{way}_formula_MiB"] > 0

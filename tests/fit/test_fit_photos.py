@@ -178,6 +178,21 @@ def test_estimate_of_memory() -> None:
     scene = Gaussians.random(10)
     floats = sum(p.numel() for p in scene.parameters())
     assert bytes_for(scene, 20) == 2 * (6 * 4 * floats + 10 * 600)
-    check_growth(scene, 0, 1)
+    check_growth(scene, 0, 1, scene.device, 10)
     free = free_bytes(torch.device("cpu"))
     assert free is None or free > 0
+
+
+def test_estimate_of_memory_of_a_scene_that_is_drawn_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 1000 splats a step drew 100: of 2000 it will draw 200, and its device has to hold these and their gradients."""
+    scene, gpu = Gaussians.random(1000), torch.device("cuda")
+    each = 4 * sum(p[0].numel() for p in scene.parameters())
+    needed = {"cpu": 2000 * (6 * each + 100) - 1000 * (6 * each + 100) * 4 // 6, "cuda": 200 * (2 * each + 600)}
+    free = dict(needed)
+    monkeypatch.setattr(tsplat.fit.memory, "free_bytes", lambda device: free[device.type])
+    check_growth(scene, 1000, 5, gpu, 100)
+    for place in needed:
+        free.update(needed)
+        free[place] -= 1
+        with pytest.raises(MemoryError, match=rf"^step 5: growing from 1000 to 2000 splats takes about \d+ MiB, and \d+ MiB are free on {place};"):
+            check_growth(scene, 1000, 5, gpu, 100)

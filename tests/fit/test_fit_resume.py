@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 import torch
+from compare import saved_state
 
 import tsplat.fit.trainer
 from tsplat.fit import FitConfig, Step, fit
@@ -140,19 +141,7 @@ def test_everything_resumes_bit_equal(capture: Capture, config: Make, tmp_path: 
     straight = fit(capture, c, tmp_path / "whole", progress=False)
     assert (tmp_path / "stopped" / "scene.ply").read_bytes() == (tmp_path / "whole" / "scene.ply").read_bytes()
     assert (resumed.qualities, resumed.refined) == (straight.qualities, straight.refined)
-    saved = [torch.load(tmp_path / name / "checkpoint.pt", weights_only=True)["state"] for name in ("stopped", "whole")]
-    for state in saved:
-        del state["seconds"]
-    assert flat(saved[0]) == flat(saved[1])
-
-
-def flat(state: Any) -> Any:
-    """The same, with the bytes of tensors instead of tensors, which == takes."""
-    if isinstance(state, dict):
-        return {key: flat(value) for key, value in state.items()}
-    if isinstance(state, list | tuple):
-        return [flat(value) for value in state]
-    return (state.shape, state.dtype, state.numpy().tobytes()) if isinstance(state, torch.Tensor) else state
+    assert saved_state(tmp_path / "stopped") == saved_state(tmp_path / "whole")
 
 
 def test_nothing_is_saved_right_after_a_reset(capture: Capture, config: Make, tmp_path: Path) -> None:

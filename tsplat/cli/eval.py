@@ -31,19 +31,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--out", type=Path, metavar="OUT.json", help="also write the metrics of each photo to this file")
     add_json(parser)
     add_device(parser)
-    add_fields(parser, ("downscale", "test_every", "background", "antialiased"))
+    add_fields(parser, ("downscale", "test_every", "background", "antialiased", "offload"))
 
 
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
     beside = options.scene.with_name("config.json")
     config = config_of(options, read_config(beside) if beside.is_file() else FitConfig())
-    scene = load_scene(options.scene).to(device_of(options.device))
+    scene, device = load_scene(options.scene), device_of(options.device)
     config = dataclasses.replace(config, primitive="spheres" if isinstance(scene, Spheres) else "gaussians")
     capture = load_capture(options.data, downscale=config.downscale, test_every=config.test_every)
     if not capture.test:
         raise ValueError(f"{options.data}: expected held-out photos; there are none with test_every = {config.test_every}")
-    qualities = evaluate(scene, capture, capture.test, config)
+    qualities = evaluate(scene.to(config.home(device)), capture, capture.test, config, device=device)
     if options.json:
         print_json(metrics_of(qualities))
     else:

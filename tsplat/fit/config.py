@@ -6,6 +6,8 @@ import math
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
+import torch
+
 from tsplat.checks import check_choice
 from tsplat.scene.gaussians import MAX_SH_DEGREE
 
@@ -33,6 +35,7 @@ class FitConfig:
 
     Raises:
         ValueError, TypeError: naming the field, what came and what is expected.
+        NotImplementedError: `offload` of spheres.
     """
 
     primitive: Primitive = field(default="gaussians", metadata=_about(BASICS, "what the scene is made of"))
@@ -97,6 +100,8 @@ class FitConfig:
     lr_sh0: float = field(default=2.5e-3, metadata=_about(RATES, "learning rate of the constant colour coefficients", 0))
     lr_sh_rest: float = field(default=1.25e-4, metadata=_about(RATES, "learning rate of the other colour coefficients", 0))
     seed: int = field(default=0, metadata=_about(BASICS, "of all that is random", 0, 2**62))
+    offload: bool = field(default=False, metadata=_about(BASICS,
+        "keep the scene in host memory; a step takes to the device what its camera may see (Gaussians only; the same result)", decides=False))
     video: int = field(default=0, metadata=_about(OUTPUT, "frames of a turntable, OUT/turntable.gif; 0: none", 0, decides=False))
     checkpoint_every: int = field(default=500, metadata=_about(OUTPUT, "steps between checkpoints", 1, decides=False))
 
@@ -105,6 +110,12 @@ class FitConfig:
             _check(item.name, str(item.type), getattr(self, item.name), item.metadata["low"], item.metadata["high"])
         if self.density_start > self.density_stop:
             raise ValueError(f"density_start: expected at most density_stop = {self.density_stop:g}; got {self.density_start!r}")
+        if self.offload and self.primitive != "gaussians":
+            raise NotImplementedError(f"offload: only scenes of Gaussians can stay in host memory yet; got primitive = {self.primitive!r}")
+
+    def home(self, device: torch.device) -> torch.device:
+        """Where the scene of a fit that computes on `device` is kept."""
+        return torch.device("cpu") if self.offload else device
 
     def value(self, name: str, *, random_start: bool = False) -> float:
         """Of a field of which the default, None, stands for what suits the kind of fit (`DEFAULTS`).

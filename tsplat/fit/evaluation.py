@@ -28,18 +28,19 @@ class Quality(NamedTuple):
 
 @torch.no_grad()
 def evaluate(gaussians: Scene, capture: Capture, views: Sequence[int], config: FitConfig, pictures: Path | None = None,
-             cameras: Mapping[int, Camera] | None = None) -> dict[str, Quality]:
+             cameras: Mapping[int, Camera] | None = None, device: torch.device | None = None) -> dict[str, Quality]:
     """Compare renders, clamped to 0..1, with photos `views` of a capture.
 
     Args:
-        config: `primitive`, `background` and `antialiased` of it are used.
+        config: `primitive`, `background`, `antialiased` and `offload` of it are used.
         cameras: by view, instead of the capture's (see `refined_cameras`).
         pictures: an existing folder for one PNG per photo: the photo on the left, the render on the right.
+        device: where to draw, default where the scene is; another with `offload` only.
 
     Returns:
         The quality by the photo's name.
     """
-    device = gaussians.device
+    device = device or gaussians.device
     background = fixed_background(config).to(device)
     primitive, qualities = primitive_of(config), {}
     for view in views:
@@ -52,12 +53,12 @@ def evaluate(gaussians: Scene, capture: Capture, views: Sequence[int], config: F
     return qualities
 
 
-def refined_cameras(gaussians: Scene, capture: Capture, views: Sequence[int], config: FitConfig) -> dict[int, Camera]:
+def refined_cameras(gaussians: Scene, capture: Capture, views: Sequence[int], config: FitConfig, device: torch.device) -> dict[int, Camera]:
     """The cameras of photos `views`, with poses that suit the scene best as it is: their loss is minimised, the scene is frozen.
 
-    For fits that refine poses, where those of held-out photos would be left behind.
+    For fits that refine poses, where those of held-out photos would be left behind. `device` is where to draw.
     """
-    primitive, device = primitive_of(config), gaussians.device
+    primitive = primitive_of(config)
     background = fixed_background(config).to(device)
     cameras = {}
     gaussians.requires_grad_(False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Protocol, TypeAlias
 
 from torch import Tensor
@@ -13,6 +14,7 @@ from tsplat.fit.density import MCMC, AdaptiveControl, Budget, Control, NoControl
 from tsplat.fit.drawing import draw
 from tsplat.fit.initial import initial_gaussians
 from tsplat.fit.losses import scene_regulariser
+from tsplat.fit.offload import draw_rows
 from tsplat.fit.optimiser import learning_rates
 from tsplat.fit.schedules import density_schedule, reset_interval, sh_degree_at
 from tsplat.fit.sphere_primitive import SphereDrawing, SpherePrimitive
@@ -37,7 +39,7 @@ class Primitive(Protocol):
 
     def draw(self, scene: Scene, camera: Camera, background: Tensor, config: FitConfig, step: int | None = None, *, depth: bool = False,
              probes: Mapping[str, Tensor] | None = None) -> Drawing:
-        """Render as at `step`, or (None) as finished."""
+        """Render as at `step`, or (None) as finished, on the device of camera and background."""
         ...
 
     def regulariser(self, scene: Scene, rendering: Any, extent: float, weights: Mapping[str, float]) -> Tensor | None:
@@ -71,9 +73,9 @@ class GaussianPrimitive:
     def draw(self, scene: Scene, camera: Camera, background: Tensor, config: FitConfig, step: int | None = None, *, depth: bool = False,
              probes: Mapping[str, Tensor] | None = None) -> Rendering:
         """With the bands of colours that are in use at `step`."""
-        degree = None if step is None else sh_degree_at(config, step)
-        return draw(scene, camera, background, sh_degree=degree, antialiased=config.antialiased, depth="accumulated" if depth else None,
-                    probes=probes)
+        drawn = partial(draw, camera=camera, background=background, sh_degree=None if step is None else sh_degree_at(config, step),
+                        antialiased=config.antialiased, depth="accumulated" if depth else None)
+        return draw_rows(drawn, scene, camera, probes or {}) if config.offload else drawn(scene, probes=probes)
 
     def regulariser(self, scene: Scene, rendering: Rendering, extent: float, weights: Mapping[str, float]) -> Tensor | None:
         """See `scene_regulariser`."""

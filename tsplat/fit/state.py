@@ -29,7 +29,9 @@ class FitState:
         control: its density control.
         photos: what is fitted to each photo.
         generator: the source of all that is random (on the CPU, whatever the device).
+        device: where a step is computed, and `photos` are; not always where the scene is (`FitConfig.offload`).
         step: steps done.
+        drawn: the most splats that one of them drew, since the fit was last started.
         queue: photos yet to come before all are shuffled anew, last first.
         seconds: wall time spent so far.
         history: of loss, PSNR and splats.
@@ -40,17 +42,20 @@ class FitState:
     control: Control
     photos: PhotoParameters
     generator: torch.Generator
+    device: torch.device
     step: int = 0
+    drawn: int = 0
     queue: list[int] = field(default_factory=list)
     seconds: float = 0.0
     history: History = field(default_factory=History)
 
     @classmethod
-    def of(cls, scene: Scene, capture: Capture, config: FitConfig, generator: torch.Generator) -> FitState:
+    def of(cls, scene: Scene, capture: Capture, config: FitConfig, generator: torch.Generator, device: torch.device) -> FitState:
         """The state before the first step."""
         control = primitive_of(config).control(config, capture.extent, len(scene))
-        photos = PhotoParameters(len(capture), config).to(scene.device)
-        return cls(scene, make_adam(scene, visible_only=config.optimiser == "visible"), control, photos, generator)
+        photos = PhotoParameters(len(capture), config).to(device)
+        scene = scene.to(config.home(device))
+        return cls(scene, make_adam(scene, visible_only=config.optimiser == "visible"), control, photos, generator, device)
 
     def next_view(self, views: Sequence[int]) -> int:
         """One of `views` at random, without replacement until all had their turn."""
@@ -67,8 +72,8 @@ class FitState:
 
     @classmethod
     def from_state_dict(cls, saved: dict[str, Any], capture: Capture, config: FitConfig, device: torch.device) -> FitState:
-        """The state that `state_dict` described, with its scene on `device`."""
-        state = cls.of(primitive_of(config).load(saved["gaussians"]).to(device), capture, config, torch.Generator())
+        """The state that `state_dict` described, of a fit that goes on on `device`."""
+        state = cls.of(primitive_of(config).load(saved["gaussians"]), capture, config, torch.Generator(), device)
         state.adam.load_state_dict(saved["adam"])
         state.control.load_state_dict(saved["control"])
         state.photos.load_state_dict(saved["photos"])

@@ -94,7 +94,7 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
         progress: show a line with loss, PSNR and number of splats.
         callbacks: each is called after each step; `tsplat.fit.to_writer` makes one for TensorBoard, `tsplat.viewer.page.training_page` one for a
             web page.
-        device: where to compute.
+        device: where to compute. (The scene is in host memory with `config.offload`, else there.)
 
     Raises:
         ValueError, FileNotFoundError: bad data, no photo to train on, a checkpoint of another fit.
@@ -124,26 +124,25 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
     if output is not None:
         save_checkpoint(output.checkpoint, state, config, capture)
         output.pictures.mkdir(exist_ok=True)
-    qualities = evaluate(state.gaussians, capture, capture.test, config, None if output is None else output.pictures)
+    qualities = evaluate(state.gaussians, capture, capture.test, config, None if output is None else output.pictures, device=state.device)
     refined = {}
     if config.refine_poses:
-        cameras = refined_cameras(state.gaussians, capture, capture.test, config)
-        refined = evaluate(state.gaussians, capture, capture.test, config, cameras=cameras)
+        cameras = refined_cameras(state.gaussians, capture, capture.test, config, state.device)
+        refined = evaluate(state.gaussians, capture, capture.test, config, cameras=cameras, device=state.device)
     if output is not None:
         output.write(state.gaussians, config, qualities, refined, state.seconds)
         state.history.write(output.curves)
         if qualities:
             write_sheet(output.sheet, [output.pictures / picture_name(name) for name in qualities])
         if config.video:
-            write_turntable(output.turntable, state.gaussians, capture, config, config.video)
+            write_turntable(output.turntable, state.gaussians, capture, config, config.video, state.device)
     return FitResult(state.gaussians, qualities, refined, state.seconds)
 
 
 def start(capture: Capture, config: FitConfig, device: torch.device) -> FitState:
     """The state before the first step."""
     generator = torch.Generator().manual_seed(config.seed)
-    scene = primitive_of(config).start(capture, config, generator).to(device)
-    return FitState.of(scene, capture, config, generator)
+    return FitState.of(primitive_of(config).start(capture, config, generator), capture, config, generator, device)
 
 
 def train_step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStream | None = None) -> Step:
@@ -167,8 +166,7 @@ def train_step(state: FitState, capture: Capture, config: FitConfig, images: Pho
 
 
 def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStream | None) -> Step:
-    scene, primitive, extent = state.gaussians, primitive_of(config), capture.extent
-    device = scene.device
+    scene, device, primitive, extent = state.gaussians, state.device, primitive_of(config), capture.extent
     view = state.next_view(capture.train)
     photo = (images or capture.images)[view].to(device)
     if images is not None and state.queue:
@@ -185,15 +183,17 @@ def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStr
         loss = loss + config.depth_weight * depth_loss(rendering.depth, rendering.alpha, truth.to(device))
     weights = regulariser_weights(config, state.step, random_start=not capture.has_points)
     regulariser = primitive.regulariser(scene, rendering, extent, weights)
-    loss = loss if regulariser is None else loss + regulariser
+    loss = loss if regulariser is None else loss + regulariser.to(device)
     state.adam.zero_grad()
     state.photos.zero_grad()
     loss.backward()                                       # type: ignore[no-untyped-call]
     _check_finite(float(loss.detach()), [scene, state.photos], f"step {state.step + 1}, photo {capture.names[view]}")
-    check_growth(scene, state.control.growth(scene, state.step + 1), state.step + 1)
+    seen = rendering.meta.visible.any(0)
+    state.drawn = max(state.drawn, int(seen.sum()))
+    check_growth(scene, state.control.growth(scene, state.step + 1), state.step + 1, rendering.image.device, state.drawn)
     state.control.observe(rendering.meta, camera)
     set_rates(state.adam, primitive.rates(config, extent, state.step))
-    adam_step(state.adam, rendering.meta.visible.any(0))
+    adam_step(state.adam, seen)
     primitive.confine(scene)
     state.photos.step(view, config, state.step)
     state.step += 1

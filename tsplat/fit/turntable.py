@@ -46,9 +46,9 @@ def turntable(capture: Capture, frames: int) -> list[Camera]:
 
 
 @torch.no_grad()
-def write_turntable(path: Path, scene: Scene, capture: Capture, config: FitConfig, frames: int) -> None:
-    """Write the turn as a clip (`tsplat.pictures.write_clip`)."""
-    device, primitive = scene.device, primitive_of(config)
+def write_turntable(path: Path, scene: Scene, capture: Capture, config: FitConfig, frames: int, device: torch.device) -> None:
+    """Write the turn, drawn on `device`, as a clip (`tsplat.pictures.write_clip`)."""
+    primitive = primitive_of(config)
     background = fixed_background(config).to(device)
     write_clip(path, (primitive.draw(scene, camera.to(device), background, config).image for camera in turntable(capture, frames)), FPS)
 

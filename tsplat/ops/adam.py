@@ -35,7 +35,7 @@ def _adam_rows_cpu(parameter: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq:
                    beta2: float, eps: float) -> None:
     rows = visible.nonzero()[:, 0]
     k = steps[rows] + 1
-    g, m, v = grad[rows], exp_avg[rows], exp_avg_sq[rows]
+    g, m, v = (x.index_select(0, rows) for x in (grad, exp_avg, exp_avg_sq))                # x[rows] takes 9 times as long
     m.lerp_(g, 1 - beta1)
     v.mul_(beta2).addcmul_(g, g, value=1 - beta2)
     column = (-1,) + (1,) * (g.ndim - 1)

@@ -6,12 +6,14 @@ import contextlib
 import functools
 import importlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 from torch.library import custom_op
+
+Maybe = TypeVar("Maybe", Tensor, Tensor | None)
 
 PLAIN = frozenset((Tensor, torch.nn.Parameter))
 """Tensors that have no `__torch_dispatch__` or `__torch_function__` of their own."""
@@ -146,6 +148,29 @@ def contiguous(function: Callable[..., tuple[Tensor, ...]]) -> Callable[..., Any
     def call(*args: Any) -> Any:
         return tuple(r.contiguous() for r in function(*args))
     return functools.wraps(function)(call)
+
+
+def rows_of(mask: Tensor, *gradients: Tensor | None) -> Tensor | None:
+    """The rows n, int64, of pairs in `mask`, bool `[C, N]`, with any gradient `[C, N]` or `[C, N, D]` that is not 0; None if those are all.
+
+    With these alone, a stage on a CPU spends nothing on splats that are not seen, and gives the others the same bits however many there
+    are: products of matrices and sums over splats are rounded in another way with another number of rows.
+    """
+    given = [((v if v.ndim > 2 else v[..., None]) != 0).any(-1) for v in gradients if v is not None]
+    seen = (mask & functools.reduce(torch.logical_or, given) if given else mask).any(0)
+    return None if bool(seen.all()) else seen.nonzero()[:, 0]
+
+
+def at(values: Maybe, rows: Tensor | None, dim: int = 0) -> Maybe:
+    """`values` at `rows` along `dim`, as they are if either is None."""
+    return values if values is None or rows is None else values.index_select(dim, rows)
+
+
+def spread(values: Maybe, rows: Tensor | None, n: int, dim: int = 0) -> Maybe:
+    """The inverse of `at`: `values` as `rows` of n along `dim`, the others 0."""
+    if values is None or rows is None:
+        return values
+    return values.new_zeros(*values.shape[:dim], n, *values.shape[dim + 1:]).index_copy_(dim, rows, values)
 
 
 def _looped(op: Callable[..., Any]) -> Callable[..., tuple[Any, Any]]:

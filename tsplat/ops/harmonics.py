@@ -8,7 +8,7 @@ import torch
 import tsplat_reference as reference
 from torch import Tensor
 
-from tsplat.ops.common import Op, contiguous, run_kernel, second_derivative
+from tsplat.ops.common import Op, at, contiguous, rows_of, run_kernel, second_derivative, spread
 
 Three = tuple[Tensor, Tensor, Tensor]
 
@@ -33,7 +33,9 @@ def _harmonics_backward(means: Tensor, centers: Tensor, coeffs: Tensor, degree: 
 
 
 def _harmonics_cpu(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:
-    return reference.harmonics(means, centers, coeffs, degree, mask).contiguous()
+    rows = rows_of(mask)
+    out = reference.harmonics(at(means, rows), centers, at(coeffs, rows), degree, at(mask, rows, 1))
+    return spread(out, rows, len(means), 1).contiguous()
 
 
 def _harmonics_fake(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor) -> Tensor:
@@ -43,8 +45,10 @@ def _harmonics_fake(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int,
 @contiguous
 def _harmonics_backward_cpu(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor, v_out: Tensor, cameras: bool = True
                             ) -> Three:
-    v_means, v_centers, v_coeffs = reference.harmonics_backward(means, centers, coeffs, degree, mask, v_out)
-    return v_means, v_centers if cameras else centers.new_empty(0, 3), v_coeffs
+    rows, n = rows_of(mask, v_out), len(means)
+    v_means, v_centers, v_coeffs = reference.harmonics_backward(at(means, rows), centers, at(coeffs, rows), degree, at(mask, rows, 1),
+                                                                at(v_out, rows, 1))
+    return spread(v_means, rows, n), v_centers if cameras else centers.new_empty(0, 3), spread(v_coeffs, rows, n)
 
 
 def _harmonics_backward_fake(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask: Tensor, v_out: Tensor, cameras: bool = True

@@ -9,7 +9,7 @@ import tsplat_reference as reference
 from torch import Tensor
 from tsplat_reference import Projection
 
-from tsplat.ops.common import Op, contiguous, run_kernel, second_derivative
+from tsplat.ops.common import Op, at, contiguous, rows_of, run_kernel, second_derivative, spread
 
 Five = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 Six = tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
@@ -49,9 +49,13 @@ def _project_cpu(*args: Any) -> Five:
 @contiguous
 def _project_backward_cpu(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor,
                           viewmats: Tensor, Ks: Tensor, width: int, height: int, model: str, near: float, far: float, eps2d: float,
-                          antialiased: bool, *gradients: Any) -> Six:
-    return _some_empty(means, reference.project_backward(
-        means, quats, scales, covars, viewmats, Ks, width, height, model, eps2d, antialiased, *gradients))
+                          antialiased: bool, radii: Tensor, v_means2d: Tensor, v_depths: Tensor | None, v_conics: Tensor,
+                          v_compensations: Tensor | None, cameras: bool = True) -> Six:
+    rows = rows_of(radii[..., 0] > 0, v_means2d, v_depths, v_conics, v_compensations)
+    results = reference.project_backward(
+        at(means, rows), at(quats, rows), at(scales, rows), at(covars, rows), viewmats, Ks, width, height, model, eps2d, antialiased,
+        at(radii, rows, 1), at(v_means2d, rows, 1), at(v_depths, rows, 1), at(v_conics, rows, 1), at(v_compensations, rows, 1), cameras)
+    return _some_empty(means, (*(spread(v, rows, len(means)) for v in results[:4]), *results[4:]))
 
 
 def _some_empty(means: Tensor, results: tuple[Tensor | None, ...]) -> Six:

@@ -82,6 +82,15 @@ DISTRIBUTED: Columns = {
     "bytes sent": lambda r: f"{r['bytes']:,}",
     "formula": lambda r: f"{r['formula']:,}",
 }
+OFFLOAD: Columns = {
+    "splats": lambda r: f"{r['splats']:,}",
+    "optimiser": lambda r: r["optimiser"],
+    "taken": lambda r: f"{r['with']['taken']:,.0f}",
+    "ms without": lambda r: f"{r['without']['ms']:.0f}",
+    "ms with": lambda r: f"{r['with']['ms']:.0f}",
+    "MiB down": lambda r: f"{r['with']['down_MiB']:.2f}",
+    "MiB up": lambda r: f"{r['with']['up_MiB']:.2f}",
+}
 
 
 def sections(report: Row) -> list[tuple[str, Columns, list[Row]]]:
@@ -92,7 +101,7 @@ def sections(report: Row) -> list[tuple[str, Columns, list[Row]]]:
         return [part for run in report["runs"] for part in sections(run)]
     rows = [row for row in report.get("rows", []) if "error" not in row]
     kinds = (("gsplat", "Gaussians on a GPU, beside gsplat", GPU), ("rival_ms", "Gaussians on a CPU", CPU), ("part", "Spheres", SPHERES),
-             ("ranks", "Many processes", DISTRIBUTED))
+             ("ranks", "Many processes", DISTRIBUTED), ("without", "Scenes in host memory", OFFLOAD))
     return [(title + (f", commit {report['commit']}" if "commit" in report else ""), columns, rows)
             for key, title, columns in kinds if rows and key in rows[0]]
 

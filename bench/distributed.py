@@ -1,6 +1,6 @@
 """`tsplat.rasterize(..., group=...)`: bytes sent per step, scaling on the cores of this machine, and a model of what GPUs would do.
 
-    python bench/distributed.py               # all tables; --quick: small scenes; --json FILE: also the figures
+    python bench/distributed.py               # all tables; --quick: small scenes; --json: as a document
     python bench/distributed.py --model       # the model alone, which needs no other process
 
 **Bytes.** A step, forward and backward, sends between ranks
@@ -50,7 +50,6 @@ from __future__ import annotations
 import argparse
 import datetime
 import json
-import os
 import platform
 import statistics
 import tempfile
@@ -62,6 +61,7 @@ from typing import Any
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
+from output import add_json, environment, print_json, printing
 from scenes import random_scene
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -200,8 +200,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small scenes")
     parser.add_argument("--model", action="store_true", help="only the model")
-    parser.add_argument("--json", type=Path, help="also write the results here")
+    add_json(parser)
     args = parser.parse_args()
+    with printing(args.json):
+        found = measure_all(args)
+    if args.json:
+        print_json(found)
+
+
+def measure_all(args: argparse.Namespace) -> dict[str, Any]:
+    """The tables."""
     rows: list[dict[str, Any]] = []
     if not args.model:
         n, size, times = (2_000, (160, 90), 2) if args.quick else (50_000, (640, 360), 7)
@@ -217,11 +225,7 @@ def main() -> None:
             sizes = " | ".join(f"{r[key]:,}" for key in ("splats", "cameras", "visible", "elsewhere", "bytes", "formula", "loopback"))
             print(f"| {ranks} | {threads} | {sizes} | {timing} |", flush=True)
         print()
-    model = print_model()
-    if args.json:
-        machine = f"{platform.machine()}, {os.cpu_count()} cores"
-        found = {"torch": torch.__version__, "machine": machine, "date": str(datetime.date.today()), "rows": rows, "model": model}
-        args.json.write_text(json.dumps(found, indent=1) + "\n")
+    return {**environment("cpu"), "rows": rows, "model": print_model()}
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import torch
-from output import add_json, print_json, printing
+from output import add_json, environment, print_json, printing
 from torch import Tensor
 
 import tsplat.fit.offload
@@ -135,7 +135,7 @@ def measure_all(sizes: list[int], device: torch.device) -> dict[str, Any]:
                       f"{apart['choosing_ms']:.1f} | {apart['down_MiB']:.2f} | {apart['down_formula_MiB']:.2f} | {apart['up_MiB']:.2f} | "
                       f"{apart['up_formula_MiB']:.2f} | {peaks[0]} | {peaks[1]} |", flush=True)
                 rows.append({"splats": n, "optimiser": optimiser, "without": plain, "with": apart})
-    return {"device": name, "torch": torch.__version__, "threads": torch.get_num_threads(), "rows": rows}
+    return {**environment(device.type), "rows": rows}
 
 
 def main() -> None:

@@ -16,7 +16,8 @@ torch.cuda.is_available = lambda: True
 def measured(*arguments, **options):
     print("| a table |")
     return {"rows": [1.5]}
-for name, options in (("cpu", ["--quick"]), ("spheres", ["--no-figure", "--device", "cpu"]), ("gpu", []), ("offload", [])):
+for name, options in (("cpu", ["--quick"]), ("spheres", ["--no-figure", "--device", "cpu"]), ("gpu", []), ("offload", []),
+                      ("distributed", [])):
     module = __import__(name)
     module.measure_all = measured                       # the measurements themselves take minutes, and a GPU
     out, sys.argv = io.StringIO(), [name, "--json", *options]
@@ -29,7 +30,7 @@ for name, options in (("cpu", ["--quick"]), ("spheres", ["--no-figure", "--devic
 def test_speed() -> None:
     done = subprocess.run([sys.executable, "-c", SPEED], env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
-    assert done.stderr == "| a table |\n" * 4
+    assert done.stderr == "| a table |\n" * 5
 
 
 def test_quality(tmp_path: Path) -> None:

@@ -1,7 +1,9 @@
-"""The README's code runs, and does what the text beside it says; what it links to is there."""
+"""The README's code and that in `help(tsplat.rasterize)` run, and do what the text beside them says; what README links to is there."""
 
 from __future__ import annotations
 
+import doctest
+import inspect
 import math
 import os
 import re
@@ -59,7 +61,8 @@ def opengl_pixel(c2w: Tensor, focal: float, point: Tensor = POINT) -> Tensor:
 
 def test_rendering_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    tsplat.Gaussians.from_points(torch.randn(50, 3) * 0.3, torch.rand(50, 3), 0).save(tmp_path / "scene.ply")
+    (tmp_path / "out").mkdir()
+    tsplat.Gaussians.from_points(torch.randn(50, 3) * 0.3, torch.rand(50, 3), 0).save(tmp_path / "out" / "scene.ply")
     [code] = section("Render a scene")
     names = run(code)
     assert (names["scene"].means.grad != 0).any()
@@ -122,6 +125,18 @@ def test_many_gpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         torch.distributed.destroy_process_group()
     assert scene.means.grad is not None
     assert (scene.means.grad != 0).any()
+
+
+def test_help_of_rasterize() -> None:
+    """Its example runs, and each argument is explained."""
+    help_text = tsplat.rasterize.__doc__ or ""
+    [example] = doctest.DocTestFinder().find(tsplat.rasterize, "rasterize", globs={"torch": torch, "tsplat": tsplat})
+    assert doctest.DocTestRunner().run(example, clear_globs=False) == doctest.TestResults(failed=0, attempted=7)
+    assert (example.globs["means"].grad != 0).any()
+    for name in inspect.signature(tsplat.rasterize).parameters:
+        assert f"\n        {name}: " in help_text, name
+    for name in ("image", "alpha", "depth", "meta"):
+        assert f"`{name}`" in help_text.partition("Returns:")[2].partition("Raises:")[0], name
 
 
 def test_no_code_is_left_out() -> None:

@@ -30,7 +30,7 @@ EXAMPLES = """
 """
 AXES = {sign + axis: tuple(float(f"{sign}1") * (axis == a) for a in "xyz") for sign in ("", "-") for axis in "xyz"}
 SIZE = (800, 600)
-MOST = 16384                         # pixels along a side: 2 GB in float32; beyond, systems kill the program rather than refuse it memory
+MOST = 16384                         # pixels along a side: 3 GB of colours in float32. Beyond, systems kill a program rather than refuse it memory
 FRAMES = 120
 BACKGROUNDS = {"black": 0.0, "white": 1.0, "transparent": None}
 

@@ -1,10 +1,14 @@
-"""The README's code runs, and does what the text beside it says; what it links to is there."""
+"""The README's code and that in `help(tsplat.rasterize)` run, and do what the text beside them says; what README links to is there."""
 
 from __future__ import annotations
 
+import doctest
+import inspect
+import json
 import math
 import os
 import re
+import shlex
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +18,7 @@ from torch import Tensor
 
 import tsplat
 from tsplat.cli import main
-from tsplat.scene import read_image
+from tsplat.scene import read_image, write_synthetic_capture
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -22,11 +26,11 @@ SIZE = {"width": 64, "height": 48}
 POINT = torch.tensor([0.3, -0.2, 0.1])              # of the world, seen by all cameras below
 
 
-def section(title: str) -> list[str]:
-    """The code of a section."""
+def section(title: str, language: str = "python") -> list[str]:
+    """The code of a section in one language."""
     text = README.split(f"\n## {title}\n")
     assert len(text) == 2, title
-    return re.findall(r"```python\n(.*?)```", text[1].split("\n## ")[0], re.DOTALL)
+    return re.findall(rf"```{language}\n(.*?)```", text[1].split("\n## ")[0], re.DOTALL)
 
 
 def run(code: str, **names: Any) -> dict[str, Any]:
@@ -59,11 +63,27 @@ def opengl_pixel(c2w: Tensor, focal: float, point: Tensor = POINT) -> Tensor:
 
 def test_rendering_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    tsplat.Gaussians.from_points(torch.randn(50, 3) * 0.3, torch.rand(50, 3), 0).save(tmp_path / "scene.ply")
+    (tmp_path / "out").mkdir()
+    tsplat.Gaussians.from_points(torch.randn(50, 3) * 0.3, torch.rand(50, 3), 0).save(tmp_path / "out" / "scene.ply")
     [code] = section("Render a scene")
     names = run(code)
     assert (names["scene"].means.grad != 0).any()
     assert read_image(tmp_path / "picture.png").shape == (600, 800, 3)
+
+
+def test_commands_of_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """With a small scene and few photos in place of the fit's."""
+    monkeypatch.chdir(tmp_path)
+    write_synthetic_capture("out/capture", views=4, size=(32, 24))
+    tsplat.Gaussians.from_points(torch.randn(50, 3) * 0.3, torch.rand(50, 3), 0).save("out/scene.ply")
+    [code] = section("Render a scene", "sh")
+    lines = code.splitlines()
+    assert len(lines) == 5
+    for line in lines:
+        assert main(shlex.split(line, comments=True)[1:]) == 0, line
+    for name in ("orbit_000.png", "orbit_011.png", "flight.gif", "difference.png", "out/scene.spz"):
+        assert Path(name).exists(), name
+    assert json.loads(re.findall(r"^\{\n.*?^\}", capsys.readouterr().out, re.DOTALL | re.MULTILINE)[0])["count"] == 50
 
 
 def test_spheres() -> None:
@@ -122,6 +142,18 @@ def test_many_gpus(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         torch.distributed.destroy_process_group()
     assert scene.means.grad is not None
     assert (scene.means.grad != 0).any()
+
+
+def test_help_of_rasterize() -> None:
+    """Its example runs, and each argument is explained."""
+    help_text = tsplat.rasterize.__doc__ or ""
+    [example] = doctest.DocTestFinder().find(tsplat.rasterize, "rasterize", globs={"torch": torch, "tsplat": tsplat})
+    assert doctest.DocTestRunner().run(example, clear_globs=False) == doctest.TestResults(failed=0, attempted=7)
+    assert (example.globs["means"].grad != 0).any()
+    for name in inspect.signature(tsplat.rasterize).parameters:
+        assert f"\n        {name}: " in help_text, name
+    for name in ("image", "alpha", "depth", "meta"):
+        assert f"`{name}`" in help_text.partition("Returns:")[2].partition("Raises:")[0], name
 
 
 def test_no_code_is_left_out() -> None:

@@ -88,7 +88,8 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
         opacities: `[N]`, in [0, 1] as a rule; above 1 a splat is opaque farther out (alpha = min(alpha_max, o exp(-sigma))).
         colors: `[N, D]` or `[C, N, D]`, any D from 1; or with `sh_degree` SH coefficients `[N, K, D]`, K >= (sh_degree + 1)^2, of which a
             colour max(SH + 0.5, 0) is made in each camera's direction.
-        camera: one or a batch of C cameras.
+        camera: `Camera.look_at(eye, target, width=, height=, fov=)`, or `Camera(viewmats, Ks, width, height)` with world-to-camera matrices
+            `[4, 4]` and intrinsics `[3, 3]`, or `[C, 4, 4]` and `[C, 3, 3]` for a batch. OpenCV's axes: x right, y down, z forward.
         sh_degree: 0 to 4: the bands to use of SH coefficients in `colors`.
         covars: `[N, 3, 3]` symmetric covariances.
         background: `[D]` or `[C, D]`, default zeros.
@@ -108,9 +109,25 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
             the splats of all ranks; gradients go to the owners. For W ranks, `colors`, `screen_offset` and `absgrad` that are per camera have
             W C for C: the own splats in the cameras of all ranks. How to train so: `tsplat.distributed`.
 
+    Tensors are float32 or float64, all of one dtype and on one device.
+
+    Returns:
+        `Rendering`: `image` `[H, W, D]`, not clamped; `alpha` `[H, W]`, 1 minus the background's weight; `depth` `[H, W]`, or None if it was
+        not asked for; `meta`, with radii, projected means and what else happened on the way. All have a leading C if the camera is a batch.
+
     Raises:
         ValueError, TypeError: naming the argument, what came and what is expected; on all ranks of the group where these differ.
         NotImplementedError: on a GPU where Triton is not installed, for forward-mode derivatives, and for `capacity` with `group`.
+
+    Example, of three red splats in a row:
+        >>> means = torch.tensor([[-1.0, 0, 0], [0, 0, 0], [1, 0, 0]], requires_grad=True)
+        >>> quats, scales = torch.tensor([[1.0, 0, 0, 0]]).expand(3, 4), torch.full((3, 3), 0.2)
+        >>> colors = torch.tensor([[1.0, 0, 0]]).expand(3, 3)
+        >>> camera = tsplat.Camera.look_at((0, -1, -4), (0, 0, 0), width=64, height=48, fov=50)
+        >>> rendering = tsplat.rasterize(means, quats, scales, torch.full((3,), 0.8), colors, camera)
+        >>> rendering.image.shape
+        torch.Size([48, 64, 3])
+        >>> rendering.image.square().mean().backward()                # the gradient is in means.grad
     """
     ranks = 1
     if group is not None:

@@ -15,7 +15,7 @@ import torch
 from tsplat.cli import main
 from tsplat.fit import FitConfig
 from tsplat.fit.checkpoint import read_checkpoint
-from tsplat.scene import Gaussians, read_image, write_synthetic_capture
+from tsplat.scene import Gaussians, Spheres, read_image, write_synthetic_capture
 
 SHORT = ["--steps", "4", "--splats", "200", "--quiet"]
 
@@ -155,6 +155,8 @@ def test_info_capture(capture_folder: Path, capsys: pytest.CaptureFixture[str]) 
     (["fit", "{capture}", "-o", "{tmp}/out", "--device", "toaster"], "--device: expected"),
     (["fit", "{capture}", "-o", "{tmp}/out", "--primitive", "spheres", "--density", "mcmc"], "density: expected 'budget'"),
     (["fit", "{capture}", "-o", "{tmp}/out", "--config", "{scene}"], "cloud.ply: expected a config.json"),
+    (["render", "{scene}", "-o", "{tmp}/a.png", "--device", "xla"], "--device: xla cannot be used here: "),
+    (["convert", "{tmp}/spheres.ply", "{tmp}/a.spz"], "spheres.ply: expected Gaussians, for which these formats are; got spheres"),
     (["eval", "{scene}", "{capture}", "--test-every", "0"], "expected held-out photos; there are none with test_every = 0"),
     (["render", "{tmp}/none.ply", "-o", "{tmp}/a.png"], "none.ply: No such file"),
     (["render", "{tmp}/cut.ply", "-o", "{tmp}/a.png"], "cut.ply: truncated"),
@@ -177,12 +179,21 @@ def test_errors_are_one_line(arguments: list[str], message: str, scene: Path, ca
         (photos / photo.name).write_bytes(photo.read_bytes()[:200])    # the header only
     (tmp_path / "cut.ply").write_bytes(scene.read_bytes()[:-100])
     (tmp_path / "photo.jpg").write_bytes(b"")
+    Spheres.from_points(torch.zeros(3, 3)).save(tmp_path / "spheres.ply")
     status = run(*(argument.format(tmp=tmp_path, scene=scene, capture=capture_folder) for argument in arguments))
     captured = capsys.readouterr()
     assert status == 2
     assert captured.err.startswith("tsplat: error: ")
     assert captured.err.count("\n") == 1
     assert message in captured.err
+
+
+def test_too_little_memory_is_one_line(scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr("tsplat.cli.render.draw_layers", lambda *_, **__: torch.empty(1 << 60))
+    assert run("render", scene, "-o", tmp_path / "a.png") == 2
+    error = capsys.readouterr().err
+    assert error.startswith("tsplat: error: not enough memory: ")
+    assert error.count("\n") == 1
 
 
 def test_debug_shows_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -194,7 +205,8 @@ def test_debug_shows_where(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 @pytest.mark.parametrize("arguments", [[], ["fit"], ["fit", "-o", "x"], ["fit", "x", "--synthetic", "-o", "x"],
-                                       ["render", "x", "-o", "x.png", "--size", "8"], ["fit", "x", "-o", "x", "--sh-degree", "a"]])
+                                       ["render", "x", "-o", "x.png", "--size", "8"],
+                                       ["render", "x", "-o", "x.png", "--size", "100000x8"], ["fit", "x", "-o", "x", "--sh-degree", "a"]])
 def test_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(arguments)

@@ -11,6 +11,8 @@ import sys
 import warnings
 from collections.abc import Sequence
 
+import torch
+
 import tsplat
 from tsplat.cli import compare, convert, eval, fit, info, render, view
 from tsplat.cli.parser import Parser
@@ -76,6 +78,11 @@ def _run(options: argparse.Namespace) -> int:
             raise
         print(f"tsplat: error: {_text(error)}", file=sys.stderr)
         return 2
+    except RuntimeError as error:
+        if debug or not _out_of_memory(error):
+            raise
+        print(f"tsplat: error: not enough memory: {_text(error).partition(chr(10))[0]}", file=sys.stderr)
+        return 2
     return 0
 
 
@@ -90,6 +97,11 @@ def _parser() -> argparse.ArgumentParser:
         subparser.add_argument("--debug", action="store_true", help="show where an error came from (also: TSPLAT_DEBUG=1)")
         subparser.set_defaults(run=command.run)
     return parser
+
+
+def _out_of_memory(error: RuntimeError) -> bool:
+    """On a CPU torch has no type of its own for it."""
+    return isinstance(error, torch.OutOfMemoryError) or "DefaultCPUAllocator" in str(error)
 
 
 def _text(error: Exception) -> str:

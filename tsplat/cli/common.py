@@ -58,11 +58,16 @@ def add_device(parser: argparse.ArgumentParser) -> None:
 
 
 def device_of(name: str) -> torch.device:
-    """The device of that name; ValueError if torch knows none."""
+    """The device of that name; ValueError if torch knows none, or cannot use it here."""
     try:
-        return torch.device(name)
+        device = torch.device(name)
     except RuntimeError:
         raise ValueError(f"--device: expected a device as torch names it, such as cpu or cuda; got {name!r}") from None
+    try:
+        torch.empty(0, device=device)
+    except (RuntimeError, AssertionError) as error:                                  # AssertionError: torch was built without it
+        raise ValueError(f"--device: {name} cannot be used here: {str(error).partition(chr(10))[0]}") from None
+    return device
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 
 from tsplat.cli.common import SCENE
-from tsplat.scene import Gaussians
+from tsplat.scene import Spheres, load_scene
 from tsplat.scene.formats import FORMATS
 
 HELP = "write a scene in another file format"
@@ -27,7 +27,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Run the command."""
     out: Path = options.out
-    gaussians = Gaussians.load(options.scene)
+    gaussians = load_scene(options.scene)
+    if isinstance(gaussians, Spheres):
+        raise ValueError(f"{options.scene}: expected Gaussians, for which these formats are; got spheres, which only their own .ply holds")
     out.parent.mkdir(parents=True, exist_ok=True)
     gaussians.save(out)
     print(f"{len(gaussians)} splats: {out} ({out.stat().st_size} bytes)")

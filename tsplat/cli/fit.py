@@ -56,7 +56,7 @@ def run(options: argparse.Namespace) -> None:
     if options.synthetic:
         data = options.out / "capture"
         if not (data / "sparse" / "0" / "points3D.txt").exists():              # the file that is written last
-            print(f"rendering a small capture of a made-up scene to {data}")
+            print(f"rendering photos of a made-up scene to {data / 'images'}", flush=True)
             write_synthetic_capture(data)
     if options.view_port is not None and not options.view:
         raise ValueError("--view-port: expected only with --view")

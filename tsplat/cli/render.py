@@ -30,6 +30,7 @@ EXAMPLES = """
 """
 AXES = {sign + axis: tuple(float(f"{sign}1") * (axis == a) for a in "xyz") for sign in ("", "-") for axis in "xyz"}
 SIZE = (800, 600)
+MOST = 16384                         # pixels along a side: 3 GB of colours in float32. Beyond, systems kill a program rather than refuse it memory
 FRAMES = 120
 BACKGROUNDS = {"black": 0.0, "white": 1.0, "transparent": None}
 
@@ -39,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", metavar="SCENE", help=SCENE)
     parser.add_argument("-o", "--out", required=True, type=Path, metavar="OUT",
                         help="the picture, or several: OUT_000.png, OUT_001.png, ...; or a clip. Its folder is made")
-    views = parser.add_argument_group("where from", "By default, from in front of the scene.")
+    views = parser.add_argument_group("where from", "By default, a little above the scene, from -z if y is vertical.")
     view = views.add_mutually_exclusive_group()
     view.add_argument("--camera", metavar="DATA", help="take a camera of this capture (folder or transforms.json)")
     view.add_argument("--orbit", type=int, metavar="N", help="N pictures from around the scene")
@@ -139,6 +140,6 @@ def _pictures(options: argparse.Namespace, scene: Scene, cameras: list[Camera]) 
 
 def _size(text: str) -> tuple[int, int]:
     width, _, height = text.partition("x")
-    if not (width.isdigit() and height.isdigit() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f"expected WxH, such as 800x600; got {text!r}")
+    if not all(side.isdecimal() and 1 <= int(side) <= MOST for side in (width, height)):
+        raise argparse.ArgumentTypeError(f"expected WxH, such as 800x600, each from 1 to {MOST}; got {text!r}")
     return int(width), int(height)

@@ -86,6 +86,17 @@ def test_commands_of_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ca
     assert json.loads(re.findall(r"^\{\n.*?^\}", capsys.readouterr().out, re.DOTALL | re.MULTILINE)[0])["count"] == 50
 
 
+def test_commands_that_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As printed, but for two steps of few splats."""
+    monkeypatch.chdir(tmp_path)
+    write_synthetic_capture("path/to/capture", views=8, size=(32, 24))
+    commands = [line.split("tsplat ", 1)[1] for code in section("Two commands", "sh") for line in code.splitlines() if "tsplat fit" in line]
+    assert len(commands) == 2
+    for command in commands:
+        assert main([*shlex.split(command), "--steps", "2", "--splats", "100", "--fresh"]) == 0, command
+        assert Path("out/contact.png").exists()
+
+
 def test_spheres() -> None:
     [code] = section("Spheres: Pulsar")
     assert float(run(code)["rendering"].alpha.max()) > 0.5

@@ -96,7 +96,7 @@ OFFLOAD: Columns = {
 def sections(report: Row) -> list[tuple[str, Columns, list[Row]]]:
     """Title, columns and rows of what a document has."""
     if "fits" in report:
-        return [("Quality of fits, held-out photos", QUALITY, [report])]
+        return [(f"Quality on held-out photos: {report['capture']}, {report['config'].get('primitive', 'gaussians')}", QUALITY, [report])]
     if "runs" in report:                                  # several commits on one machine
         return [part for run in report["runs"] for part in sections(run)]
     rows = [row for row in report.get("rows", []) if "error" not in row]

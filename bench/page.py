@@ -73,6 +73,7 @@ QUALITY: Columns = {
     "splats": lambda r: f"{mean(fit['splats'] for fit in r['fits']):,.0f}",
     "wall s": lambda r: spread(r["fits"], "wall_s", 0),
     "CPU s": lambda r: spread(r["fits"], "cpu_s", 0),
+    "where it goes": lambda r: r.get("profile", ""),
 }
 DISTRIBUTED: Columns = {
     "processes": lambda r: str(r["ranks"]),

@@ -54,7 +54,7 @@ def measure(name: str, description: str | None, config: FitConfig, parts: tuple[
     add_fields(parser, [item.name for item in dataclasses.fields(FitConfig) if item.name != "seed"])
     options = parser.parse_args()
     config = config_of(options, config)
-    fits = []
+    fits, shares = [], None
     with printing(options.json):
         for seed in options.seeds:
             chosen = dataclasses.replace(config, seed=seed)
@@ -70,12 +70,12 @@ def measure(name: str, description: str | None, config: FitConfig, parts: tuple[
                   f"{chosen.steps} steps, {wall:.1f} s wall, {cpu:.1f} s CPU, {torch.get_num_threads()} threads"
                   + "".join(f"; {psnr:.2f} dB after {seconds:.0f} s" for seconds, psnr in curve.points), flush=True)
             if shares:
-                print(shares.text)
+                print(f"  {shares.text}")
     if options.picture:
         _write_picture(options.picture, result.gaussians, capture, chosen)
     if options.json:
         changed = {item.name: value for item in dataclasses.fields(FitConfig) if (value := getattr(config, item.name)) != item.default}
-        print_json({**environment(options.device), "capture": name, "config": changed, "fits": fits})
+        print_json({**environment(options.device), "capture": name, "config": changed, "fits": fits, "profile": shares.text if shares else ""})
 
 
 def _write_picture(path: Path, scene: Scene, capture: Capture, config: FitConfig) -> None:
@@ -103,7 +103,7 @@ class _Shares:
             total = sum(event.self_cpu_time_total for event in events.values())
             shares = {f"{stage}{way}": sum(event.cpu_time_total for key, event in events.items() if re.fullmatch(name + suffix, key))
                       for stage, name in STAGES.items() for way, suffix in (("", ""), (", backward", "_?[Bb]ackward"))}
-            self.text = f"  of {1e-3 * total / PROFILED:.0f} ms a step: " + ", ".join(
+            self.text = f"of {1e-3 * total / PROFILED:.0f} ms a step: " + ", ".join(
                 f"{name} {100 * us / total:.0f} %" for name, us in sorted(shares.items(), key=lambda item: -item[1]) if us > total / 100)
 
 

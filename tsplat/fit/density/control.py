@@ -14,15 +14,23 @@ from tsplat.camera import Camera
 
 @dataclass(frozen=True)
 class Schedule:
-    """Act after the steps that are multiples of `every`, from `start` on and before `stop` (counted from 1)."""
+    """Act after the steps that are multiples of `every`, from `start` on and before `stop` (counted from 1).
+
+    Where a loop counts several steps at a time, `batch`, it acts when it came to or past one of these.
+    """
 
     start: int
     stop: int
     every: int
+    batch: int = 1
 
     def due(self, step: int) -> bool:
         """Whether to act after `step` steps."""
-        return self.start <= step < self.stop and step % self.every == 0
+        return self.start <= step - step % self.every < self.stop and self.passed(step, self.every)
+
+    def passed(self, step: int, every: int) -> bool:
+        """Whether the last batch came to or past a multiple of `every`."""
+        return step % every < self.batch
 
     def part(self, step: int) -> float:
         """Which part of the actions is behind after that of `step`: above 0, and 1 for the last."""

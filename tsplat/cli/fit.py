@@ -36,7 +36,7 @@ EXAMPLES = """
   tsplat fit capture -o out --downscale 4 --steps 7000 --max-splats 200000
   tsplat fit capture -o again --config out/config.json
   tsplat fit capture -o out --view                     watch it in a web page
-  torchrun --nproc-per-node=8 --max-restarts=3 -m tsplat fit capture -o out --device cuda
+  torchrun --nproc-per-node=8 -m tsplat fit capture -o out --device cuda
 """
 VIEW_PORT = 8080
 POLL_SECONDS = 0.2

@@ -74,7 +74,7 @@ class Ranks:
         return everyone
 
     def gather(self, values: Tensor) -> tuple[Tensor, slice]:
-        """`[N]` of the splats of all ranks, and which of them are those of this rank, from `[n]` of its own.
+        """`[N, ...]` of the splats of all ranks, and which of them are those of this rank, from `[n, ...]` of its own.
 
         For scores, which decide between all splats: 4 bytes for each on every rank, and 16 more where they are sorted, for a moment; projection
         holds 44 for each camera.
@@ -83,7 +83,7 @@ class Ranks:
             return values, slice(0, len(values))
         sizes = self.sizes(len(values))
         first = sum(sizes[:self.rank])
-        everyone = self._exchange(values.detach().repeat(self.count), [len(values)] * self.count, sizes)
+        everyone = self._exchange(torch.cat([values.detach()] * self.count), [len(values)] * self.count, sizes)
         return everyone, slice(first, first + len(values))
 
     def moved(self, rows: Tensor, old: list[int], new: list[int]) -> Tensor:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -93,7 +94,9 @@ def load_rows(path: Path, saved: dict[str, Any], ranks: Ranks) -> dict[str, Any]
     folder = path.with_name(saved["shards"]["folder"])
     map_rows(saved["state"], ask)
     try:
-        load(pieces, checkpoint_id=folder, no_dist=True)
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="torch.distributed is")       # that each process reads alone
+            load(pieces, checkpoint_id=folder, no_dist=True)
     except CheckpointException as error:
         raise ValueError(f"{folder}: expected the splats of the checkpoint {path.name}; {_reason(error)}") from None
     return map_rows(saved["state"], lambda name, _: torch.cat([pieces[f"{name}/{rank}"][part] for rank, part in parts]))

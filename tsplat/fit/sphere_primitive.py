@@ -97,9 +97,6 @@ class SpherePrimitive:
 
     def control(self, config: FitConfig, extent: float, splats: int, ranks: Ranks = ALONE) -> Control:
         """Pruning and refining, or nothing with the density control `none`."""
-        if ranks.count > 1:
-            raise NotImplementedError(f"primitive: expected 'gaussians' with more than one process; got 'spheres' with {ranks.count}, and spheres "
-                                      "are not rendered by several yet")
         if config.density == "none":
             return NoControl()
         if config.density != "budget":

@@ -267,11 +267,15 @@ def _due(state: FitState, config: FitConfig) -> bool:
 
 def _check_ranks(capture: Capture, config: FitConfig, ranks: Ranks) -> None:
     """What several ranks cannot do, before anything is computed."""
+    if ranks.count == 1:
+        return
     sizes = sorted(set(zip(capture.width, capture.height, strict=True)))
-    if ranks.count > 1 and len(sizes) > 1:
+    if len(sizes) > 1:
         few = ", ".join(f"{width}x{height}" for width, height in sizes[:3]) + (", ..." if len(sizes) > 3 else "")
         raise ValueError(f"data: expected photos of one size with more than one process; got {len(sizes)} sizes: {few}")
-    if ranks.count > 1 and config.video:
+    if config.primitive != "gaussians":
+        raise NotImplementedError(f"primitive: expected 'gaussians' with more than one process; got {config.primitive!r}")
+    if config.video:
         raise NotImplementedError(f"video: expected 0 with more than one process; got {config.video} (`tsplat render scene.ply --orbit` makes one "
                                   "of the scene)")
 

@@ -161,7 +161,8 @@ def check_splats_move_with_all_that_is_known_of_them(ranks: Ranks) -> None:
     uneven = [190, 10] if ranks.count == 2 else [0, 150, 50]
     before, image, had = rows_of(state), view_of(state, capture), fit_ranks.sizes(len(state.gaussians))
     assert len(before) == 6 * 3 + 2                        # parameters and two moments of each; gradients and views
-    state = FitState.from_state_dict(map_rows(state.state_dict(), lambda _, rows: fit_ranks.moved(rows, had, uneven)), capture, config, CPU, fit_ranks)
+    moved = map_rows(state.state_dict(), lambda _, rows: fit_ranks.moved(rows, had, uneven))
+    state = FitState.from_state_dict(moved, capture, config, CPU, fit_ranks)
     assert fit_ranks.sizes(len(state.gaussians)) == uneven
     assert moves(uneven)
     assert_same_bits(list(rows_of(state).values()), list(before.values()))

@@ -110,13 +110,15 @@ def test_a_rank_that_is_killed(capture: Path, tmp_path: Path) -> None:
         process.send_signal(signal.SIGINT)
         assert process.wait(SECONDS) != 0
     text = log.read_text()
-    assert f"tsplat: error: process 0: another process of this fit has ended; the same command goes on from {out / 'checkpoint.pt'}, after step {kept}" in text
-    assert f"tsplat: stopped after step {step_of(out)} of 1000000; the same call goes on from {out / 'checkpoint.pt'}" in text
+    path = out / "checkpoint.pt"
+    assert f"tsplat: error: process 0: another process of this fit has ended; the same command goes on from {path}, after step {kept}" in text
+    assert f"tsplat: stopped after step {step_of(out)} of 1000000; the same call goes on from {path}" in text
     saved = read_checkpoint(out / "checkpoint.pt")["shards"]
     assert [path.name for path in out.iterdir() if path.is_dir()] == [saved["folder"]]
 
 
-def test_wrong_command_lines_under_torchrun(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_wrong_command_lines_under_torchrun(capture: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                            capsys: pytest.CaptureFixture[str]) -> None:
     for name, value in (("RANK", "0"), ("WORLD_SIZE", "2"), ("LOCAL_RANK", "0"), ("LOCAL_WORLD_SIZE", "2")):
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 0)
@@ -154,12 +156,12 @@ def test_the_backend_is_that_of_the_device(monkeypatch: pytest.MonkeyPatch) -> N
 
 def test_when_splats_move() -> None:
     """Where the largest is 1.1 times the mean, and moving makes a difference."""
-    assert not moves([100]) and not moves([110, 90]) and not moves([0, 0, 0]) and not moves([0, 0, 1])
-    assert moves([111, 89]) and moves([1, 0, 0]) and moves([0, 300, 0])
+    assert [moves(sizes) for sizes in ([100], [110, 90], [0, 0, 0], [0, 0, 1])] == [False] * 4
+    assert [moves(sizes) for sizes in ([111, 89], [1, 0, 0], [0, 300, 0])] == [True] * 3
 
 
 def test_curves_of_several_photos_a_step() -> None:
-    """A point for each interval that is passed, of 1000 photos two."""
+    """A point for each interval of 2 photos that is passed, and the last."""
     history = History()
     for step in range(3, 1003, 3):
         history.add(step, 1000, 1.0, float(step), 7)

@@ -70,16 +70,14 @@ class AdaptiveControl(NoControl):
             if self.reset_every and step > self.reset_every:
                 keep &= scene.get_parameter("log_scales").amax(1) <= math.log(HUGE * self.extent)
             prune(scene, optimiser, keep)
-        if self.reset_every and self.schedule.passed(step, self.reset_every) and self._resets(step - step % self.reset_every):
+        if self._last_reset(step) > step - self.schedule.batch:
             scene.get_parameter("opacity_logits").clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
             forget(scene, optimiser, slice(None), ("opacity_logits",))
 
     def settled(self, step: int) -> bool:
         """False in the `settle` steps that begin with a reset."""
-        if not self.reset_every:
-            return True
-        last = step - step % self.reset_every
-        return not (self._resets(last) and step < last + self.settle)
+        last = self._last_reset(step)
+        return not last or step >= last + self.settle
 
     def state_dict(self) -> dict[str, Any]:
         """The sums of gradients."""
@@ -89,8 +87,9 @@ class AdaptiveControl(NoControl):
         """Take on what `state_dict` gave."""
         self.gradients.load_state_dict(saved["gradients"])
 
-    def _resets(self, step: int) -> bool:
-        return 0 < step < self.schedule.stop
+    def _last_reset(self, step: int) -> int:
+        """The step of the last reset up to `step`; 0: there was none."""
+        return max(0, self.schedule.last(step, self.reset_every)) if self.reset_every else 0
 
     def _parents(self, scene: nn.Module) -> Tensor:
         means = scene.get_parameter("means")

@@ -26,16 +26,16 @@ class Schedule:
 
     def due(self, step: int) -> bool:
         """Whether to act after `step` steps."""
-        return self.start <= step - step % self.every < self.stop and self.passed(step, self.every)
+        return self.last(step, self.every) > max(self.start - 1, step - self.batch)
 
-    def passed(self, step: int, every: int) -> bool:
-        """Whether the last batch came to or past a multiple of `every`."""
-        return step % every < self.batch
+    def last(self, step: int, every: int) -> int:
+        """The last multiple of `every` up to `step` and before `stop`."""
+        return min(step, self.stop - 1) // every * every
 
     def part(self, step: int) -> float:
         """Which part of the actions is behind after that of `step`: above 0, and 1 for the last."""
         first, last = -(-self.start // self.every), (self.stop - 1) // self.every
-        return min(1.0, (step // self.every - first + 1) / max(1, last - first + 1))
+        return min(1.0, (self.last(step, self.every) // self.every - first + 1) / max(1, last - first + 1))
 
 
 class Control(Protocol):

@@ -141,17 +141,18 @@ def test_the_backend_is_that_of_the_device(monkeypatch: pytest.MonkeyPatch) -> N
     called: list[object] = []
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
     monkeypatch.setattr(torch.cuda, "set_device", called.append)
-    monkeypatch.setattr(torch.distributed, "init_process_group", called.append)
+    monkeypatch.setattr(torch.distributed, "rendezvous", lambda url: iter([(torch.distributed.HashStore(), 3, 4)]))
+    monkeypatch.setattr(torch.distributed, "init_process_group", lambda backend, store, rank, world_size: called.append((backend, rank, world_size)))
     monkeypatch.setattr(torch.distributed, "destroy_process_group", lambda: called.append("destroyed"))
     for name, value in (("RANK", "3"), ("WORLD_SIZE", "4"), ("LOCAL_RANK", "1")):
         monkeypatch.setenv(name, value)
     with torchrun.joined(torch.device("cuda")) as (_, device):
         assert device == torch.device("cuda", 1)
-    assert called == [torch.device("cuda", 1), "nccl", "destroyed"]
+    assert called == [torch.device("cuda", 1), ("nccl", 3, 4), "destroyed"]
     called.clear()
     with torchrun.joined(torch.device("cpu")) as (_, device):
         assert device == torch.device("cpu")
-    assert called == ["gloo", "destroyed"]
+    assert called == [("gloo", 3, 4), "destroyed"]
 
 
 def test_when_splats_move() -> None:

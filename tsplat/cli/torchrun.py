@@ -59,7 +59,10 @@ def joined(device: torch.device) -> Iterator[tuple[ProcessGroup | None, torch.de
         torch.cuda.set_device(device)                    # also where torch.distributed puts what it pickles
     previous = signal.signal(signal.SIGTERM, _end)
     try:
-        dist.init_process_group("nccl" if device.type == "cuda" else "gloo")
+        # torchrun 2.13 keeps its store over a restart: without a prefix, processes would look for each other where the ended ones were
+        store, here, count = next(dist.rendezvous("env://"))
+        store = dist.PrefixStore(os.environ.get("TORCHELASTIC_RESTART_COUNT", "0"), store)
+        dist.init_process_group("nccl" if device.type == "cuda" else "gloo", store=store, rank=here, world_size=count)
         yield dist.group.WORLD, device
         dist.destroy_process_group()                     # not after an error: others may wait for this process
     finally:

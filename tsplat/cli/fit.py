@@ -108,7 +108,8 @@ def _fit(options: argparse.Namespace, data: Capture | str | Path, config: FitCon
                      callbacks=callbacks, device=device, group=group)
     except (RuntimeError, torchrun.Ended) as error:
         if isinstance(error, torchrun.Ended) or (group is not None and torchrun.is_loss(error)):
-            raise ConnectionError(f"process {torchrun.rank()}: another process of this fit has ended; " + (
+            ended = "ended by torchrun, as where " if isinstance(error, torchrun.Ended) else ""
+            raise ConnectionError(f"process {torchrun.rank()}: {ended}another process of this fit has ended; " + (
                 f"the same command goes on from {checkpoint}, after step {read_checkpoint(checkpoint)['state']['step']}" if checkpoint.exists()
                 else "there is no checkpoint yet")) from error
         raise

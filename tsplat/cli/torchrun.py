@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Ended(ConnectionError):
-    """torchrun ends this process, as it does where another one has ended."""
+    """torchrun ends this process (SIGTERM), as it does where another one has ended, or when it is told to end."""
 
 
 def ranks() -> int:
@@ -76,4 +76,4 @@ def is_loss(error: BaseException) -> bool:
 
 
 def _end(_signal: int, _frame: FrameType | None) -> None:
-    raise Ended("ended by torchrun (SIGTERM)")
+    raise Ended("ended by torchrun, as where another process has ended (SIGTERM)")

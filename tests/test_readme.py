@@ -103,8 +103,8 @@ def test_conventions() -> None:
 
 
 def test_no_code_is_left_out() -> None:
-    """The sections above, and that of the peers, whose code tests/compat runs."""
-    tested = ["Render a scene", "Spheres: Pulsar", "Conventions", "Coming from gsplat, Inria or Pulsar"]
+    """The sections above, that of the peers, whose code tests/compat runs, and that of many GPUs, whose calls tests/distributed makes on CPUs."""
+    tested = ["Render a scene", "Spheres: Pulsar", "Many GPUs", "Conventions", "Coming from gsplat, Inria or Pulsar"]
     assert sum(len(section(title)) for title in tested) == README.count("```python")
 
 

@@ -124,7 +124,7 @@ def test_ctrl_c_between_frames_leaves_no_half_a_clip(tmp_path: Path, monkeypatch
 
 def test_ctrl_c_in_the_evaluation_names_the_checkpoint(capture_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
                                                        capsys: pytest.CaptureFixture[str]) -> None:
-    def interrupted(*_: Any) -> None:
+    def interrupted(*_: Any, **options: Any) -> None:
         raise KeyboardInterrupt
 
     arguments = ["fit", str(capture_folder), "-o", str(tmp_path), "--steps", "2", "--splats", "200"]

@@ -172,6 +172,11 @@ def check_splats_move_with_all_that_is_known_of_them(ranks: Ranks) -> None:
     assert not moves(had)
     assert_same_bits(list(rows_of(state).values()), list(before.values()))
     assert_close(view_of(state, capture), image, 1e-6)
+    chunk, tsplat.fit.ranks.CHUNK = tsplat.fit.ranks.CHUNK, 7
+    scene = state.whole_scene(config)
+    tsplat.fit.ranks.CHUNK = chunk
+    assert_same_bits(list(scene.state_dict().values()), [before[f"gaussians/{name}"] if ranks.rank == 0 else value.detach()
+                                                         for name, value in state.gaussians.named_parameters()])
     train_step(state, capture, config)
     assert list(state.adam.state) == list(state.gaussians.parameters())
 

@@ -39,7 +39,7 @@ def make_adam(scene: nn.Module, *, visible_only: bool = False) -> Adam | Visible
 
 def set_rates(adam: Optimizer, rates: dict[str, float], photos: int = 1) -> None:
     """Give each group the rate of its name, and betas to the power of `photos`, those of a step: moments then remember as many photos
-    as with one at a time (Grendel, Zhao et al. 2024, section 4.2).
+    as with one at a time (Grendel, Zhao et al. 2024).
     """
     for group in adam.param_groups:
         group["lr"], group["betas"] = rates[group["name"]], (BETAS[0]**photos, BETAS[1]**photos)

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from torch.distributed import ProcessGroup  # some builds of torch have none
 
 T = TypeVar("T")
-CHUNK = 1 << 20        # rows that a rank sends at a time to be collected: what the first has on its device besides its own
+CHUNK = 1 << 20        # rows that each rank sends at a time to be collected: bounds what the first has on its device besides its own
 
 
 class Ranks:
@@ -76,8 +76,8 @@ class Ranks:
     def gather(self, values: Tensor) -> tuple[Tensor, slice]:
         """`[N, ...]` of the splats of all ranks, and which of them are those of this rank, from `[n, ...]` of its own.
 
-        For scores, which decide between all splats: 4 bytes for each on every rank, and 16 more where they are sorted, for a moment; projection
-        holds 44 for each camera.
+        For scores, which decide between all splats: 8 bytes for each on every rank, and 16 more where they are sorted, for a moment; projection
+        holds 44 for each and each camera.
         """
         if self.group is None:
             return values, slice(0, len(values))

@@ -20,7 +20,7 @@ def rate_factor(config: FitConfig, photos: int = 1) -> float:
 
     Adam moves a parameter by about its rate per step, to and fro, so by about rate times sqrt(steps) in all, which so stays the
     same for any number of steps down to 830. Of `photos` at a time there are so many times fewer: rates rise by their square root, the
-    rule of Malladi et al. 2022 for Adam, which Grendel (Zhao et al. 2024, section 4.2) found to hold for splats.
+    rule for Adam of Malladi et al. 2022, and for splats of Grendel (Zhao et al. 2024), where gradients of photos are nearly independent.
     """
     return min(math.sqrt(REFERENCE_STEPS * photos / max(1, config.steps)), MAX_FACTOR)
 

@@ -63,7 +63,7 @@ def save_rows(path: Path, saved: dict[str, Any], ranks: Ranks) -> tuple[dict[str
 def load_rows(path: Path, saved: dict[str, Any], ranks: Ranks) -> dict[str, Any]:
     """The state with this rank's rows, from the content of a checkpoint `path`, of any number of ranks.
 
-    As many ranks as saved it have what they had; others are even.
+    As many ranks as saved it have what they had; others are even. A rank reads all that those had of whose splats it takes some.
 
     Raises:
         ValueError: the folder of the rows is not what it was.

@@ -19,6 +19,7 @@ from launch import ROOT, run_ranks
 
 from tsplat.cli import main, torchrun
 from tsplat.fit.checkpoint import read_checkpoint
+from tsplat.fit.density import Schedule
 from tsplat.fit.report import History
 from tsplat.fit.shards import moves
 from tsplat.scene import write_synthetic_capture
@@ -170,3 +171,20 @@ def test_curves_of_several_photos_a_step() -> None:
         history.add(step, 1000, 1.0, float(step), 7)
     assert [row[0] for row in history.rows[:4]] == [3, 6, 9, 12]
     assert history.rows[-1] == [1002, 1.0, 1002.0, 7]
+
+
+@pytest.mark.parametrize("batch", [1, 2, 3, 4, 5])
+@pytest.mark.parametrize("others", [1, 3, 5])
+@pytest.mark.parametrize("stop", [48, 49, 51, 60])
+def test_every_action_is_due_once(batch: int, others: int, stop: int) -> None:
+    """In a fit of 60 photos that went on with another number of ranks in between: none is left out, and the last is that of all splats."""
+    step, due, parts = 0, 0, []
+    while step < 60:
+        count = batch if step < 25 else others
+        step += count
+        schedule = Schedule(7, stop, 6, count)
+        due += schedule.due(step)
+        parts += [schedule.part(step)] * schedule.due(step)
+    assert due == len(range(12, stop, 6))
+    assert parts == sorted(set(parts))
+    assert parts[-1] == 1

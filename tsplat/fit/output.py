@@ -30,7 +30,7 @@ class Output:
         self.turntable = folder / "turntable.gif"
 
     def open(self) -> dict[str, Any] | None:
-        """Make the folder if need be; the checkpoint in it (see `read_checkpoint`), or None.
+        """Make the folder if need be; the checkpoint in it (see `read_checkpoint`), or None. What a write that was cut short left goes.
 
         Raises:
             FileExistsError: the folder is a file, or holds files of these names but no checkpoint, which would show that

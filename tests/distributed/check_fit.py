@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 from collections.abc import Callable
 from pathlib import Path
@@ -217,6 +218,12 @@ def check_checkpoints_load_on_any_number_of_ranks(ranks: Ranks) -> None:
             file.write_bytes(file.read_bytes()[:100])
     dist.barrier()
     expect(ValueError, f"{path}.0: expected the splats of the checkpoint checkpoint.pt; rank 0: ",
+           lambda: restore(path, read_checkpoint(path), config, capture, CPU, fit_ranks))
+    dist.barrier()
+    if ranks.rank == 0:
+        shutil.rmtree(f"{path}.0")
+    dist.barrier()
+    expect(ValueError, f"{path}.0: expected the splats of the checkpoint checkpoint.pt; the folder is not there",
            lambda: restore(path, read_checkpoint(path), config, capture, CPU, fit_ranks))
 
 

@@ -47,6 +47,7 @@ def save_rows(path: Path, saved: dict[str, Any], ranks: Ranks) -> tuple[dict[str
 
     folder = ranks.objects(next(f for f in folders(path) if not f.exists()) if ranks.rank == 0 else path)[0]
     rows: dict[str, Any] = {}
+
     def take(name: str, tensor: Tensor) -> Tensor:
         rows[f"{name}/{ranks.rank}"] = tensor
         return tensor.new_empty(0, *tensor.shape[1:])        # not tensor[:0], with which all of it would be saved
@@ -93,6 +94,8 @@ def load_rows(path: Path, saved: dict[str, Any], ranks: Ranks) -> dict[str, Any]
 
     folder = path.with_name(saved["shards"]["folder"])
     map_rows(saved["state"], ask)
+    if not (folder / ".metadata").exists():                  # of which torch would print how it looked for it
+        raise ValueError(f"{folder}: expected the splats of the checkpoint {path.name}; the folder is not there, or not whole")
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="torch.distributed is")       # that each process reads alone

@@ -18,11 +18,12 @@ import torch.distributed as dist
 
 @dataclass
 class Ranks:
-    """Where this process is."""
+    """Where this process is, and a folder that all ranks have."""
 
     rank: int
     count: int
     group: Any
+    folder: Path = Path()
 
 
 def expect(kind: type[Exception], text: str, call: Callable[[], object]) -> None:
@@ -40,7 +41,7 @@ def main() -> None:
             if name.startswith("check_"):
                 torch.manual_seed(0)
                 print(module.__name__, name, flush=True)            # the last line before an error says where
-                check(Ranks(rank, count, dist.group.WORLD))
+                check(Ranks(rank, count, dist.group.WORLD, folder))
     dist.destroy_process_group()
 
 

@@ -57,7 +57,7 @@ def test_exposure_changes_one_photo_and_leaves_the_mean(config: Make) -> None:
     image = torch.rand(4, 5, 3, generator=torch.Generator().manual_seed(0))
     assert torch.equal(photos.expose(image, 1), image)
     photos.expose(image, 1).sum().backward()
-    photos.step(1, config(exposure=True), 0)
+    photos.step([1], config(exposure=True), 0)
     assert photos.exposures is not None
     assert (photos.exposures[1] != 0).all()
     assert (photos.exposures[[0, 2]] == 0).all()

@@ -57,14 +57,14 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--device", default="cpu", help="where to compute, as torch names it (default: cpu)")
 
 
-def device_of(name: str) -> torch.device:
-    """The device of that name; ValueError if torch knows none, or cannot use it here."""
+def device_of(name: str, *, used: bool = True) -> torch.device:
+    """The device of that name; ValueError if torch knows none, or, where it is to be `used`, cannot use it here."""
     try:
         device = torch.device(name)
     except RuntimeError:
         raise ValueError(f"--device: expected a device as torch names it, such as cpu or cuda; got {name!r}") from None
     try:
-        torch.empty(0, device=device)
+        torch.empty(0, device=device if used else None)
     except (RuntimeError, AssertionError) as error:                                  # AssertionError: torch was built without it
         raise ValueError(f"--device: {name} cannot be used here: {str(error).partition(chr(10))[0]}") from None
     return device

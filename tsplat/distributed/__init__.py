@@ -34,7 +34,8 @@ process, which decides between equal depths, so that images are those of one pro
 - Density control works on each rank alone: `meta.radii`, `meta.means2d`, `screen_offset` and `absgrad` are `[ranks C, N]`, the own splats
   in all cameras, those of rank 0 first. With the loss above, screen-space gradients are those of a batch: the number of all cameras times
   smaller than of a loss of one image, for which thresholds are made. Ranks grow differently; when their numbers differ much, move splats (a
-  plain `all_to_all_single` of rows) between steps.
+  plain `all_to_all_single` of rows) between steps. The objects of `tsplat.fit.density` know of ranks (`tsplat.fit.ranks.Ranks`) and do all this
+  but the moving, and `tsplat.fit.fit(..., group=group)` is a whole training loop.
 
 All ranks make the same calls in the same order. What only one rank can see (a tensor of a wrong shape) raises on that rank only; `torchrun`
 then ends the others. Under torch.compile, what differs between ranks raises without saying what.

@@ -1,4 +1,8 @@
-"""Checkpoints: files from which a fit goes on as if it had never stopped, written whole or not at all."""
+"""Checkpoints: files from which a fit goes on as if it had never stopped, written whole or not at all.
+
+Of one process it is one file. Of several, each writes the rows of its splats to a folder beside that file, by `torch.distributed.checkpoint`; the
+file has the rest, and names the folder. As it takes the place of the old one when the folder is whole, there is a whole checkpoint at any moment.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +15,8 @@ from typing import Any
 import torch
 
 from tsplat.fit.config import FitConfig
+from tsplat.fit.ranks import ALONE, Ranks
+from tsplat.fit.shards import load_rows, remove_others, save_rows
 from tsplat.fit.state import FitState
 from tsplat.scene import Capture
 from tsplat.scene.files import replacing
@@ -19,12 +25,21 @@ FORMAT = "tsplat fit 2"
 
 
 def save_checkpoint(path: Path, state: FitState, config: FitConfig, capture: Capture) -> None:
-    """Write `path`; an older file stays until the new one is on the disk.
+    """Write `path`, on all ranks of the state; an older file stays until the new one is on the disk.
 
     Raises:
         OSError: it cannot be written (a full disk); the older file stays as it was.
     """
-    saved = {"format": FORMAT, "state": state.state_dict(), "config": asdict(config), "photos": _photos(capture)}
+    saved: dict[str, Any] = {"format": FORMAT, "state": state.state_dict(), "config": asdict(config), "photos": _photos(capture)}
+    if state.ranks.count > 1:
+        saved["state"], saved["shards"] = save_rows(path, saved["state"], state.ranks)
+    with state.ranks.agreement():
+        if state.ranks.rank == 0:
+            _write(path, saved)
+            remove_others(path, saved)
+
+
+def _write(path: Path, saved: dict[str, Any]) -> None:
     with replacing(path) as temporary, temporary.open("wb") as file:
         try:
             torch.save(saved, file)
@@ -34,11 +49,13 @@ def save_checkpoint(path: Path, state: FitState, config: FitConfig, capture: Cap
         os.fsync(file.fileno())
 
 
-def restore(path: Path, saved: dict[str, Any], config: FitConfig, capture: Capture, device: torch.device) -> FitState:
+def restore(path: Path, saved: dict[str, Any], config: FitConfig, capture: Capture, device: torch.device,
+            ranks: Ranks = ALONE) -> FitState:
     """The state of the fit that `config` and `capture` describe, from what `read_checkpoint(path)` gave.
 
     Raises:
-        ValueError: naming the file, if it is of another fit: the first field that differs, or the photos.
+        ValueError: naming the file, if it is of another fit: the first field that differs, or the photos; or the folder of its splats, if that
+            is broken.
     """
     for item in fields(FitConfig):
         ours, theirs = getattr(config, item.name), saved["config"].get(item.name)
@@ -48,7 +65,7 @@ def restore(path: Path, saved: dict[str, Any], config: FitConfig, capture: Captu
     if saved["photos"] != _photos(capture):
         raise ValueError(f"{path}: made from other photos, or ones of another size; start afresh (resume=False), or choose "
                          "another folder")
-    return FitState.from_state_dict(saved["state"], capture, config, device)
+    return FitState.from_state_dict(load_rows(path, saved, ranks), capture, config, device, ranks)
 
 
 def read_checkpoint(path: Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -12,15 +13,19 @@ from tsplat.fit.config import FitConfig
 from tsplat.rasterize import DepthMode, Rendering, rasterize
 from tsplat.scene import Gaussians
 
+if TYPE_CHECKING:
+    from torch.distributed import ProcessGroup
+
 
 def draw(gaussians: Gaussians, camera: Camera, background: Tensor | None = None, *, sh_degree: int | None = None,
-         antialiased: bool = False, depth: DepthMode | None = None, probes: Mapping[str, Tensor] | None = None) -> Rendering:
+         antialiased: bool = False, depth: DepthMode | None = None, probes: Mapping[str, Tensor] | None = None,
+         group: ProcessGroup | None = None) -> Rendering:
     """Render with the bands of spherical harmonics up to `sh_degree` (default: all). Bands not drawn get no gradient at all.
 
     Args:
         camera: one or a batch.
         background: `[3]`, default black.
-        antialiased, depth: see `rasterize`.
+        antialiased, depth, group: see `rasterize`.
         probes: `screen_offset` or `absgrad` of `rasterize`, for density control.
     """
     probes = probes or {}
@@ -29,7 +34,7 @@ def draw(gaussians: Gaussians, camera: Camera, background: Tensor | None = None,
     sh = torch.cat([gaussians.sh0, gaussians.sh_rest[:, :rest]], dim=1) if rest else gaussians.sh0
     return rasterize(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, sh, camera, sh_degree=degree,
                      background=background, antialiased=antialiased, depth=depth,
-                     screen_offset=probes.get("screen_offset"), absgrad=probes.get("absgrad"))
+                     screen_offset=probes.get("screen_offset"), absgrad=probes.get("absgrad"), group=group)
 
 
 def fixed_background(config: FitConfig) -> Tensor:

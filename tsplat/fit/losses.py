@@ -12,6 +12,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, interpolate
 
+from tsplat.fit.ranks import ALONE, Ranks
+
 WINDOW = 11
 SIGMA = 1.5
 C1, C2 = 0.01**2, 0.03**2       # of SSIM, for images in 0..1
@@ -81,8 +83,8 @@ class Seen(Protocol):
 
 
 def scene_regulariser(opacities: Tensor, scales: Tensor, meta: Seen, extent: float, *, opacity: float, scale: float,
-                      opacity_depth: float) -> Tensor | None:
-    """The weighted sum of what the loss has besides the photo, or None without any weight.
+                      opacity_depth: float, ranks: Ranks = ALONE) -> Tensor | None:
+    """The weighted sum of what the loss has besides the photo, or None without any weight. Of several ranks, this one's part of the sum over all.
 
     Args:
         opacities, scales: `[N]` and `[N, 3]`.
@@ -90,17 +92,17 @@ def scene_regulariser(opacities: Tensor, scales: Tensor, meta: Seen, extent: flo
         extent: unit of depth.
         opacity, scale: weights of the means of both, as in 3DGS-MCMC (Kheradmand et al. 2024, equation 10).
         opacity_depth: weight of minus the mean of o z over what is visible (Pulsar, Lassner and Zollhoefer 2021): what is near
-            and opaque has to be worth it, which keeps floaters from the cameras.
+            and opaque has to be worth it, which keeps floaters from the cameras. The mean over cameras, of which each has such a mean.
+        ranks: of which each has some of the splats.
     """
     terms = []
-    if opacity and len(opacities):
-        terms.append(opacity * opacities.mean())
-    if scale and len(scales):
-        terms.append(scale * scales.mean())
+    if opacity or scale:
+        n = max(1, ranks.total(len(opacities)))
+        terms = [weight * values.sum() / (n * values.shape[1:].numel()) for weight, values in ((opacity, opacities), (scale, scales)) if weight]
     if opacity_depth:
         visible = meta.visible
-        seen = (opacities * meta.depths).where(visible, 0.0).sum() / visible.sum().clamp(min=1)
-        terms.append(-opacity_depth * seen / extent)
+        seen = (opacities * meta.depths).where(visible, 0.0).sum(1) / ranks.add(visible.sum(1)).clamp(min=1)                   # [C]
+        terms.append(-opacity_depth * seen.mean() / extent)
     return sum(terms[1:], terms[0]) if terms else None
 
 

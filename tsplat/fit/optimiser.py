@@ -10,13 +10,14 @@ from tsplat.fit.schedules import progress, rate_factor
 from tsplat.fit.visible_adam import VisibleAdam
 
 EPS = 1e-15                # as in 3DGS: gradients of single splats are tiny
+BETAS = 0.9, 0.999         # for one photo at a time
 
 
-def learning_rates(config: FitConfig, extent: float, step: int) -> dict[str, float]:
+def learning_rates(config: FitConfig, extent: float, step: int, photos: int = 1) -> dict[str, float]:
     """The learning rate of each parameter of `Gaussians` at `step`, counted from 0.
 
     That of the means falls log-linearly from `lr_means * extent` to that times `lr_means_decay` at the last step
-    (3DGS, section 7.1); the others stay. All are the config's times `rate_factor`.
+    (3DGS, section 7.1); the others stay. All are the config's times `rate_factor`, which knows how many `photos` a step has.
     """
     rates = {
         "means": config.lr_means * extent * config.lr_means_decay ** progress(config, step),
@@ -26,7 +27,7 @@ def learning_rates(config: FitConfig, extent: float, step: int) -> dict[str, flo
         "sh0": config.lr_sh0,
         "sh_rest": config.lr_sh_rest,
     }
-    factor = rate_factor(config)
+    factor = rate_factor(config, photos)
     return {name: factor * rate for name, rate in rates.items()}
 
 
@@ -36,10 +37,12 @@ def make_adam(scene: nn.Module, *, visible_only: bool = False) -> Adam | Visible
     return VisibleAdam(groups, lr=0.0, eps=EPS) if visible_only else Adam(groups, lr=0.0, eps=EPS, fused=True)
 
 
-def set_rates(adam: Optimizer, rates: dict[str, float]) -> None:
-    """Give each group the rate of its name."""
+def set_rates(adam: Optimizer, rates: dict[str, float], photos: int = 1) -> None:
+    """Give each group the rate of its name, and betas to the power of `photos`, those of a step: moments then remember as many photos
+    as with one at a time (Grendel, Zhao et al. 2024).
+    """
     for group in adam.param_groups:
-        group["lr"] = rates[group["name"]]
+        group["lr"], group["betas"] = rates[group["name"]], (BETAS[0]**photos, BETAS[1]**photos)
 
 
 def adam_step(adam: Adam | VisibleAdam, visible: Tensor) -> None:

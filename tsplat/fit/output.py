@@ -15,6 +15,7 @@ from tsplat.fit.config import FitConfig
 from tsplat.fit.evaluation import Quality, mean_quality
 from tsplat.fit.losses import SSIM_NAME
 from tsplat.fit.primitive import Scene
+from tsplat.fit.shards import remove_others
 from tsplat.scene.files import replacing
 
 
@@ -29,7 +30,7 @@ class Output:
         self.turntable = folder / "turntable.gif"
 
     def open(self) -> dict[str, Any] | None:
-        """Make the folder if need be; the checkpoint in it (see `read_checkpoint`), or None.
+        """Make the folder if need be; the checkpoint in it (see `read_checkpoint`), or None. What a write that was cut short left goes.
 
         Raises:
             FileExistsError: the folder is a file, or holds files of these names but no checkpoint, which would show that
@@ -40,12 +41,15 @@ class Output:
             raise FileExistsError(f"{self.folder}: expected a folder to write to; it is a file")
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.checkpoint.exists():
-            return read_checkpoint(self.checkpoint)
+            saved = read_checkpoint(self.checkpoint)
+            remove_others(self.checkpoint, saved)
+            return saved
         ours = (self.scene, self.metrics, self.pictures, self.config, self.curves, self.sheet, self.turntable)
         found = next((path for path in ours if path.exists()), None)
         if found is not None:
             raise FileExistsError(f"{found}: would be written over, but is not from a fit (there is no {self.checkpoint.name} "
                                   "beside it); choose another folder")
+        remove_others(self.checkpoint, None)
         return None
 
     def write(self, gaussians: Scene, config: FitConfig, qualities: dict[str, Quality], refined: dict[str, Quality], seconds: float) -> None:

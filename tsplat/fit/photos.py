@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
 
@@ -13,7 +15,9 @@ from tsplat.fit.visible_adam import VisibleAdam
 
 
 class PhotoParameters(nn.Module):
-    """C photos, of which a step sees one; the others, and their moments, rest in it (`VisibleAdam`).
+    """C photos, of which a step sees one, or one for each rank; the others, and their moments, rest in it (`VisibleAdam`).
+
+    All ranks have a copy, and the gradients of all (`Ranks.add`). Rates do not depend on the number of ranks: nor does how often a photo is seen.
 
     Args:
         photos: C.
@@ -43,8 +47,8 @@ class PhotoParameters(nn.Module):
         change = self.exposures[photo] - self.exposures.detach().mean(0)             # [3, 4]
         return image + image @ change[:, :3].T + change[:, 3]
 
-    def step(self, photo: int, config: FitConfig, step: int) -> None:
-        """Move the photo's parameters by their gradients."""
+    def step(self, photos: Sequence[int], config: FitConfig, step: int) -> None:
+        """Move the parameters of the photos of a step by their gradients."""
         if self.adam is None:
             return
         rates = {"poses": config.lr_poses * config.lr_means_decay ** progress(config, step), "exposures": config.lr_exposure}
@@ -54,5 +58,5 @@ class PhotoParameters(nn.Module):
             parameter = group["params"][0]
             seen = torch.zeros(len(parameter), dtype=torch.bool, device=parameter.device) if seen is None else seen
         assert seen is not None
-        seen[photo] = True
+        seen[list(photos)] = True
         self.adam.step(seen)

@@ -16,6 +16,7 @@ from tsplat.fit.initial import initial_gaussians
 from tsplat.fit.losses import scene_regulariser
 from tsplat.fit.offload import draw_rows
 from tsplat.fit.optimiser import learning_rates
+from tsplat.fit.ranks import ALONE, Ranks
 from tsplat.fit.schedules import density_schedule, reset_interval, sh_degree_at
 from tsplat.fit.sphere_primitive import SphereDrawing, SpherePrimitive
 from tsplat.rasterize import Rendering
@@ -38,24 +39,24 @@ class Primitive(Protocol):
         ...
 
     def draw(self, scene: Scene, camera: Camera, background: Tensor, config: FitConfig, step: int | None = None, *, depth: bool = False,
-             probes: Mapping[str, Tensor] | None = None) -> Drawing:
-        """Render as at `step`, or (None) as finished, on the device of camera and background."""
+             probes: Mapping[str, Tensor] | None = None, ranks: Ranks = ALONE) -> Drawing:
+        """Render as at `step`, or (None) as finished, on the device of camera and background; the splats of all ranks in the own camera."""
         ...
 
-    def regulariser(self, scene: Scene, rendering: Any, extent: float, weights: Mapping[str, float]) -> Tensor | None:
-        """What the loss has besides the photo."""
+    def regulariser(self, scene: Scene, rendering: Any, extent: float, weights: Mapping[str, float], ranks: Ranks = ALONE) -> Tensor | None:
+        """What the loss has besides the photo; the sum over ranks counts."""
         ...
 
-    def rates(self, config: FitConfig, extent: float, step: int) -> dict[str, float]:
-        """The learning rate of each parameter, by name."""
+    def rates(self, config: FitConfig, extent: float, step: int, photos: int = 1) -> dict[str, float]:
+        """The learning rate of each parameter, by name, for steps of so many photos."""
         ...
 
     def confine(self, scene: Scene) -> None:
         """Bring back what a step has moved out of its range."""
         ...
 
-    def control(self, config: FitConfig, extent: float, splats: int) -> Control:
-        """Density control of a scene that starts with that many splats."""
+    def control(self, config: FitConfig, extent: float, splats: int, ranks: Ranks = ALONE) -> Control:
+        """Density control of a scene that starts with that many splats, on all ranks."""
         ...
 
 
@@ -71,34 +72,34 @@ class GaussianPrimitive:
         return Gaussians(**saved)
 
     def draw(self, scene: Scene, camera: Camera, background: Tensor, config: FitConfig, step: int | None = None, *, depth: bool = False,
-             probes: Mapping[str, Tensor] | None = None) -> Rendering:
+             probes: Mapping[str, Tensor] | None = None, ranks: Ranks = ALONE) -> Rendering:
         """With the bands of colours that are in use at `step`."""
         drawn = partial(draw, camera=camera, background=background, sh_degree=None if step is None else sh_degree_at(config, step),
-                        antialiased=config.antialiased, depth="accumulated" if depth else None)
+                        antialiased=config.antialiased, depth="accumulated" if depth else None, group=ranks.group)
         return draw_rows(drawn, scene, camera, probes or {}) if config.offload else drawn(scene, probes=probes)
 
-    def regulariser(self, scene: Scene, rendering: Rendering, extent: float, weights: Mapping[str, float]) -> Tensor | None:
+    def regulariser(self, scene: Scene, rendering: Rendering, extent: float, weights: Mapping[str, float], ranks: Ranks = ALONE) -> Tensor | None:
         """See `scene_regulariser`."""
-        return scene_regulariser(scene.opacities, scene.scales, rendering.meta, extent, **weights)
+        return scene_regulariser(scene.opacities, scene.scales, rendering.meta, extent, **weights, ranks=ranks)
 
-    def rates(self, config: FitConfig, extent: float, step: int) -> dict[str, float]:
+    def rates(self, config: FitConfig, extent: float, step: int, photos: int = 1) -> dict[str, float]:
         """See `learning_rates`."""
-        return learning_rates(config, extent, step)
+        return learning_rates(config, extent, step, photos)
 
     def confine(self, scene: Scene) -> None:
         """All parameters are unbounded."""
 
-    def control(self, config: FitConfig, extent: float, splats: int) -> Control:
+    def control(self, config: FitConfig, extent: float, splats: int, ranks: Ranks = ALONE) -> Control:
         """The kind that the config names."""
-        schedule, most = density_schedule(config), config.max_splats or MAX_SPLATS
+        schedule, most = density_schedule(config, ranks.count), config.max_splats or MAX_SPLATS
         if config.density == "budget":
-            return Budget(extent, schedule, config.max_splats or splats)
+            return Budget(extent, schedule, config.max_splats or splats, ranks=ranks)
         if config.density == "mcmc":
-            return MCMC(schedule, most)
+            return MCMC(schedule, most, ranks=ranks)
         if config.density == "adaptive":
             reset = reset_interval(config)
             return AdaptiveControl(extent, schedule, threshold=config.density_threshold, absgrad=config.density_absgrad, reset_every=reset,
-                                   settle=reset // 6, max_splats=most)
+                                   settle=reset // 6, max_splats=most, ranks=ranks)
         return NoControl()
 
 

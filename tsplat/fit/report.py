@@ -37,7 +37,9 @@ class History:
     def add(self, step: int, steps: int, loss: float, psnr: float, splats: int) -> None:
         """Take note of step `step` of `steps`."""
         self.sums = [self.sums[0] + loss, self.sums[1] + psnr, self.sums[2] + 1]
-        if step % max(1, steps // BINS) == 0 or step == steps:
+        last = int(self.rows[-1][0]) if self.rows else 0
+        interval = max(1, steps // BINS)
+        if step // interval > last // interval or step >= steps:           # steps of several photos count these, and jump over multiples
             self.rows.append([float(step), self.sums[0] / self.sums[2], self.sums[1] / self.sums[2], float(splats)])
             self.sums = [0.0, 0.0, 0.0]
 

@@ -15,13 +15,14 @@ MAX_FACTOR = 6.0     # by which fits of fewer steps raise the rates
 MIN_ACTIONS = 20     # of density control, if it went on to the end
 
 
-def rate_factor(config: FitConfig) -> float:
+def rate_factor(config: FitConfig, photos: int = 1) -> float:
     """By which the rates of a fit of 30,000 steps are raised: sqrt(30,000 / steps), and at most 6, as at 10 fits diverge.
 
     Adam moves a parameter by about its rate per step, to and fro, so by about rate times sqrt(steps) in all, which so stays the
-    same for any number of steps down to 830.
+    same for any number of steps down to 830. Of `photos` at a time there are so many times fewer: rates rise by their square root, the
+    rule for Adam of Malladi et al. 2022, and for splats of Grendel (Zhao et al. 2024), where gradients of photos are nearly independent.
     """
-    return min(math.sqrt(REFERENCE_STEPS / max(1, config.steps)), MAX_FACTOR)
+    return min(math.sqrt(REFERENCE_STEPS * photos / max(1, config.steps)), MAX_FACTOR)
 
 
 def progress(config: FitConfig, step: int) -> float:
@@ -41,10 +42,10 @@ def divisor_at(config: FitConfig, step: int) -> int:
     return 4 if 2 * step < warmup else 2 if step < warmup else 1
 
 
-def density_schedule(config: FitConfig) -> Schedule:
-    """When density control acts."""
+def density_schedule(config: FitConfig, photos: int = 1) -> Schedule:
+    """When density control acts, with so many photos at a time."""
     every = min(config.density_every, max(1, config.steps // MIN_ACTIONS))
-    return Schedule(max(1, round(config.density_start * config.steps)), round(config.density_stop * config.steps), every)
+    return Schedule(max(1, round(config.density_start * config.steps)), round(config.density_stop * config.steps), every, photos)
 
 
 def regulariser_weights(config: FitConfig, step: int, *, random_start: bool) -> dict[str, float]:

@@ -17,6 +17,7 @@ from tsplat.fit.density.rows import prune, take_rows
 from tsplat.fit.drawing import fixed_background
 from tsplat.fit.initial import initial_points
 from tsplat.fit.losses import scene_regulariser
+from tsplat.fit.ranks import ALONE, Ranks
 from tsplat.fit.schedules import progress, rate_factor
 from tsplat.fit.spheres import CHILDREN, gamma_at, refine, worth_keeping
 from tsplat.scene import Capture, Spheres
@@ -73,7 +74,7 @@ class SpherePrimitive:
         return spheres
 
     def draw(self, scene: Spheres, camera: Camera, background: Tensor, config: FitConfig, step: int | None = None, *, depth: bool = False,
-             probes: Mapping[str, Tensor] | None = None) -> SphereDrawing:
+             probes: Mapping[str, Tensor] | None = None, ranks: Ranks = ALONE) -> SphereDrawing:
         """With gamma as at `step`, or (None) as in the end."""
         if depth:
             raise NotImplementedError("depth_weight: depth maps do not supervise spheres yet; expected 0")
@@ -83,13 +84,14 @@ class SpherePrimitive:
         depths = (scene.positions * viewmats[:, None, 2, :3]).sum(-1) + viewmats[:, None, 2, 3]
         return SphereDrawing(r.image, r.alpha, None, SphereMeta(r.visible.view(len(viewmats), -1), depths))
 
-    def regulariser(self, scene: Spheres, rendering: SphereDrawing, extent: float, weights: Mapping[str, float]) -> Tensor | None:
+    def regulariser(self, scene: Spheres, rendering: SphereDrawing, extent: float, weights: Mapping[str, float],
+                    ranks: Ranks = ALONE) -> Tensor | None:
         """See `scene_regulariser`."""
-        return scene_regulariser(scene.opacities, scene.radii, rendering.meta, extent, **weights)
+        return scene_regulariser(scene.opacities, scene.radii, rendering.meta, extent, **weights, ranks=ranks)
 
-    def rates(self, config: FitConfig, extent: float, step: int) -> dict[str, float]:
+    def rates(self, config: FitConfig, extent: float, step: int, photos: int = 1) -> dict[str, float]:
         """`RATES`, times `rate_factor`; that of the positions falls as that of Gaussians' means."""
-        factor = rate_factor(config)
+        factor = rate_factor(config, photos)
         scale = {"positions": extent * config.lr_means_decay ** progress(config, step)}
         return {name: factor * rate * scale.get(name, 1.0) for name, rate in RATES.items()}
 
@@ -99,7 +101,7 @@ class SpherePrimitive:
         hardens; and spheres in front of the background do not take its colour, by which they are pruned (16.9 and 20.1 dB)."""
         scene.features.clamp_(0.0, 1.0)
 
-    def control(self, config: FitConfig, extent: float, splats: int) -> Control:
+    def control(self, config: FitConfig, extent: float, splats: int, ranks: Ranks = ALONE) -> Control:
         """Pruning and refining, or nothing with the density control `none`."""
         if config.density == "none":
             return NoControl()

@@ -8,6 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from torch import nn
@@ -24,12 +25,17 @@ from tsplat.fit.optimiser import adam_step, set_rates
 from tsplat.fit.output import Output
 from tsplat.fit.primitive import Scene, primitive_of
 from tsplat.fit.progress import progress_line
+from tsplat.fit.ranks import ALONE, Ranks, even
 from tsplat.fit.report import write_sheet
 from tsplat.fit.schedules import divisor_at, regulariser_weights
+from tsplat.fit.shards import moves
 from tsplat.fit.state import FitState
 from tsplat.fit.stream import PhotoStream
 from tsplat.fit.turntable import write_turntable
 from tsplat.scene import Capture, load_capture
+
+if TYPE_CHECKING:
+    from torch.distributed import ProcessGroup  # some builds of torch have none
 
 
 @dataclass(frozen=True)
@@ -37,10 +43,10 @@ class Step:
     """What a callback is told after each step.
 
     Args:
-        number: steps done.
-        photo: its name.
-        loss, psnr: of its render before the step (PSNR in dB).
-        gaussians: the scene after the step. A callback may look at it, not change it.
+        number: steps done; of several ranks, photos.
+        photo: its name; that of this rank.
+        loss, psnr: of its render before the step (PSNR in dB); means over ranks.
+        gaussians: the scene after the step; this rank's splats. A callback may look at it, not change it.
     """
 
     number: int
@@ -55,7 +61,7 @@ class FitResult:
     """What a fit gives.
 
     Args:
-        gaussians: the scene.
+        gaussians: the scene. Of several ranks, all of it, on the CPU, on rank 0, and the own part on the others.
         qualities: PSNR and SSIM of the held-out photos, by name.
         refined: the same with the poses of these photos refined, too, where the fit refined poses; else empty.
         seconds: wall time of the steps, also of those before an interruption.
@@ -79,8 +85,14 @@ class FitResult:
 
 def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None, out: str | os.PathLike[str] | None = None, *,
         resume: bool = True, progress: bool = True, callbacks: Sequence[Callable[[Step], None]] = (),
-        device: str | torch.device = "cpu") -> FitResult:
+        device: str | torch.device = "cpu", group: ProcessGroup | None = None) -> FitResult:
     """Fit a scene to photos: one photo per step, at random without replacement, Adam on L1 and SSIM, density control.
+
+    **With a group** of K ranks, splats are sharded over them (`tsplat.distributed`), and a step takes K photos of the same order, one on each rank,
+    and minimises their mean loss; a batch may have the end of one round of all photos and the begin of the next. All that counts steps goes on
+    counting photos, so that the same config is the same fit in K times fewer steps: schedules stay, rates rise by sqrt(K) (`rate_factor`), betas are
+    to the power of K (`set_rates`). When one rank has more than 1.1 times the mean number of splats, they are made even again. All photos need one
+    size, and all ranks the same `out` on one file system.
 
     Args:
         data: a capture, or the folder of one (see `load_capture`; `downscale` and `test_every` of the config apply to a
@@ -95,6 +107,7 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
         callbacks: each is called after each step; `tsplat.fit.to_writer` makes one for TensorBoard, `tsplat.viewer.page.training_page` one for a
             web page.
         device: where to compute. (The scene is in host memory with `config.offload`, else there.)
+        group: of `torch.distributed`, all of whose ranks make the same call, each with its device. One of 1 rank is as None.
 
     Raises:
         ValueError, FileNotFoundError: bad data, no photo to train on, a checkpoint of another fit.
@@ -102,7 +115,7 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
         FloatingPointError: a loss or gradient that is not finite, naming the step, the photo and the parameter. The last
             checkpoint stays; if there is none yet, one is written.
         MemoryError: density control would take more memory than is free; before it does. As above.
-        NotImplementedError: what a primitive does not have (depth maps for spheres).
+        NotImplementedError: what a primitive does not have (depth maps for spheres), what several ranks do not (spheres, turntables).
         OSError: a file cannot be written. The last checkpoint stays.
         KeyboardInterrupt: on Ctrl-C, after the step and a checkpoint; its message says where it is.
     """
@@ -114,39 +127,46 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
         capture = load_capture(data, downscale=config.downscale, test_every=config.test_every)
     if not capture.train:
         raise ValueError(f"data: expected photos to train on; all {len(capture)} are held out (test_every = 0 holds out none)")
+    ranks = Ranks(group, device)
+    _check_ranks(capture, config, ranks)
     output = None if out is None else Output(Path(out))
     saved = None if output is None else output.open()
     if output is not None and saved is not None and resume:
-        state = restore(output.checkpoint, saved, config, capture, device)
+        state = restore(output.checkpoint, saved, config, capture, device, ranks)
     else:
-        state = start(capture, config, device)
-    _train(state, capture, config, output, progress, callbacks)
+        state = start(capture, config, device, ranks)
+    _train(state, capture, config, output, progress and ranks.rank == 0, callbacks)
     if output is not None:
         save_checkpoint(output.checkpoint, state, config, capture)
         output.pictures.mkdir(exist_ok=True)
-    qualities = evaluate(state.gaussians, capture, capture.test, config, None if output is None else output.pictures, device=state.device)
+    pictures = None if output is None else output.pictures
+    qualities = evaluate(state.gaussians, capture, capture.test, config, pictures, device=state.device, ranks=ranks)
     refined = {}
     if config.refine_poses:
-        cameras = refined_cameras(state.gaussians, capture, capture.test, config, state.device)
-        refined = evaluate(state.gaussians, capture, capture.test, config, cameras=cameras, device=state.device)
-    if output is not None:
-        output.write(state.gaussians, config, qualities, refined, state.seconds)
+        cameras = refined_cameras(state.gaussians, capture, capture.test, config, state.device, ranks)
+        refined = evaluate(state.gaussians, capture, capture.test, config, cameras=cameras, device=state.device, ranks=ranks)
+    scene = state.whole_scene(config)
+    if output is not None and ranks.rank == 0:
+        output.write(scene, config, qualities, refined, state.seconds)
         state.history.write(output.curves)
         if qualities:
             write_sheet(output.sheet, [output.pictures / picture_name(name) for name in qualities])
         if config.video:
-            write_turntable(output.turntable, state.gaussians, capture, config, config.video, state.device)
-    return FitResult(state.gaussians, qualities, refined, state.seconds)
+            write_turntable(output.turntable, scene, capture, config, config.video, state.device)
+    return FitResult(scene, qualities, refined, state.seconds)
 
 
-def start(capture: Capture, config: FitConfig, device: torch.device) -> FitState:
+def start(capture: Capture, config: FitConfig, device: torch.device, ranks: Ranks = ALONE) -> FitState:
     """The state before the first step."""
-    generator = torch.Generator().manual_seed(config.seed)
-    return FitState.of(primitive_of(config).start(capture, config, generator), capture, config, generator, device)
+    generator, primitive = torch.Generator().manual_seed(config.seed), primitive_of(config)
+    scene = primitive.start(capture, config, generator)
+    if ranks.count > 1:                                  # each has made all of it, from the same random numbers
+        scene = primitive.load({name: rows.split(even(len(rows), ranks.count))[ranks.rank] for name, rows in scene.state_dict().items()})
+    return FitState.of(scene, capture, config, generator, device, ranks)
 
 
 def train_step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStream | None = None) -> Step:
-    """Render one photo's view, compare, and move the parameters. Nothing changes if it raises.
+    """Render one photo's view (on each rank), compare, and move the parameters. Nothing changes if it raises.
 
     Args:
         state: of the fit.
@@ -166,40 +186,48 @@ def train_step(state: FitState, capture: Capture, config: FitConfig, images: Pho
 
 
 def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStream | None) -> Step:
-    scene, device, primitive, extent = state.gaussians, state.device, primitive_of(config), capture.extent
-    view = state.next_view(capture.train)
+    scene, device, primitive, extent, ranks = state.gaussians, state.device, primitive_of(config), capture.extent, state.ranks
+    number = state.step + ranks.count
+    views = [state.next_view(capture.train) for _ in range(ranks.count)]
+    view = views[ranks.rank]
     photo = (images or capture.images)[view].to(device)
-    if images is not None and state.queue:
-        images.prepare(state.queue[-1])
+    if images is not None and len(state.queue) > ranks.rank:
+        images.prepare(state.queue[-1 - ranks.rank])
     background = step_background(config, state.generator).to(device)
     camera, target = _reduced(capture.camera(view).to(device), target_of(photo, background, masked=capture.masked),
                               divisor_at(config, state.step))
     camera = state.photos.camera(camera, view, extent)
     truth = capture.depth(view, camera.width, camera.height) if config.depth_weight else None
-    probes = state.control.probes(scene, state.step + 1)
-    rendering = primitive.draw(scene, camera, background, config, state.step, depth=truth is not None, probes=probes)
+    probes = state.control.probes(scene, number, ranks.count)
+    rendering = primitive.draw(scene, camera, background, config, state.step, depth=truth is not None, probes=probes, ranks=ranks)
     loss = photo_loss(state.photos.expose(rendering.image, view), target, config.ssim_weight)
     if truth is not None and rendering.depth is not None:
         loss = loss + config.depth_weight * depth_loss(rendering.depth, rendering.alpha, truth.to(device))
     weights = regulariser_weights(config, state.step, random_start=not capture.has_points)
-    regulariser = primitive.regulariser(scene, rendering, extent, weights)
+    regulariser = primitive.regulariser(scene, rendering, extent, weights, ranks)
+    loss = loss / ranks.count                             # what is minimised is the sum over ranks
     loss = loss if regulariser is None else loss + regulariser.to(device)
     state.adam.zero_grad()
     state.photos.zero_grad()
     loss.backward()                                       # type: ignore[no-untyped-call]
-    _check_finite(float(loss.detach()), [scene, state.photos], f"step {state.step + 1}, photo {capture.names[view]}")
+    for parameter in state.photos.parameters():
+        if parameter.grad is not None:
+            parameter.grad = ranks.add(parameter.grad)
     seen = rendering.meta.visible.any(0)
     state.drawn = max(state.drawn, int(seen.sum()))
-    check_growth(scene, state.control.growth(scene, state.step + 1), state.step + 1, rendering.image.device, state.drawn)
+    added = state.control.growth(scene, number)
+    with ranks.agreement():
+        _check_finite(float(loss.detach()), [scene, state.photos], f"step {number}, photo {capture.names[view]}")
+        check_growth(scene, added, number, device, state.drawn)
     state.control.observe(rendering.meta, camera)
-    set_rates(state.adam, primitive.rates(config, extent, state.step))
+    set_rates(state.adam, primitive.rates(config, extent, state.step, ranks.count), ranks.count)
     adam_step(state.adam, seen)
     primitive.confine(scene)
-    state.photos.step(view, config, state.step)
-    state.step += 1
-    quality = float(psnr(rendering.image.detach(), target))
-    state.control.update(scene, state.adam, state.step, state.generator)
-    return Step(state.step, capture.names[view], float(loss.detach()), quality, scene)
+    state.photos.step(views, config, state.step)
+    state.step = number
+    losses, qualities = zip(*ranks.numbers(float(loss.detach()), float(psnr(rendering.image.detach(), target))), strict=True)
+    state.control.update(scene, state.adam, state.step, ranks.local(state.generator))
+    return Step(state.step, capture.names[view], sum(losses), sum(qualities) / ranks.count, scene)
 
 
 def _train(state: FitState, capture: Capture, config: FitConfig, output: Output | None, progress: bool,
@@ -215,26 +243,47 @@ def _train(state: FitState, capture: Capture, config: FitConfig, output: Output 
                 if output is not None and not kept:
                     save_checkpoint(output.checkpoint, state, config, capture)
                 raise
-            show(step.loss, step.psnr, len(state.gaussians))
-            state.history.add(step.number, config.steps, step.loss, step.psnr, len(state.gaussians))
             for callback in callbacks:
                 callback(step)
+            told = state.ranks.numbers(len(state.gaussians), interrupt.requested)
+            sizes, stop = [int(size) for size, _ in told], any(asked for _, asked in told)
+            show(step.loss, step.psnr, sum(sizes), state.ranks.count)
+            state.history.add(step.number, config.steps, step.loss, step.psnr, sum(sizes))
+            if moves(sizes):
+                state.rebalance(sizes, capture, config)
             state.seconds = before + time.perf_counter() - begin
-            if output is not None and (_due(state, config) or interrupt.requested):
+            if output is not None and (_due(state, config) or stop):
                 save_checkpoint(output.checkpoint, state, config, capture)
                 kept = True
-            if interrupt.requested:
+            if stop:
                 raise KeyboardInterrupt(f"stopped after step {state.step} of {config.steps}" + (
                     "" if output is None else f"; the same call goes on from {output.checkpoint}"))
 
 
 def _due(state: FitState, config: FitConfig) -> bool:
     """Whether to write a checkpoint now: where one is due right after a reset of opacities, it is written before that instead."""
-    step = state.step
+    step, photos = state.step, state.ranks.count
     if not state.control.settled(step):
         return False
-    following = next((s for s in range(step + 1, config.steps) if state.control.settled(s)), config.steps)
+    following = next((s for s in range(step + photos, config.steps, photos) if state.control.settled(s)), config.steps)
     return step < config.steps and any(s % config.checkpoint_every == 0 for s in range(step, following))
+
+
+def _check_ranks(capture: Capture, config: FitConfig, ranks: Ranks) -> None:
+    """What several ranks cannot do, before anything is computed."""
+    if ranks.count == 1:
+        return
+    sizes = sorted(set(zip(capture.width, capture.height, strict=True)))
+    if len(sizes) > 1:
+        few = ", ".join(f"{width}x{height}" for width, height in sizes[:3]) + (", ..." if len(sizes) > 3 else "")
+        raise ValueError(f"data: expected photos of one size with more than one process; got {len(sizes)} sizes: {few}")
+    if config.primitive != "gaussians":
+        raise NotImplementedError(f"primitive: expected 'gaussians' with more than one process; got {config.primitive!r}")
+    if config.offload:
+        raise NotImplementedError("offload: expected False with more than one process, of which each has a part of the splats")
+    if config.video:
+        raise NotImplementedError(f"video: expected 0 with more than one process; got {config.video} (`tsplat render scene.ply --orbit` makes one "
+                                  "of the scene)")
 
 
 def _reduced(camera: Camera, target: Target, divisor: int) -> tuple[Camera, Target]:

@@ -1,6 +1,7 @@
 """Density control: how the number and the places of splats change during a fit, as interchangeable objects.
 
-They know parameters and an optimiser, no trainer; in a loop of your own, with any of them:
+They know parameters and an optimiser, no trainer, and of splats on several processes what `tsplat.fit.ranks.Ranks` tells them; in a loop of your own,
+with any of them:
 
     control = AdaptiveControl(extent, Schedule(500, 15_000, 100))
     for step in range(1, steps + 1):

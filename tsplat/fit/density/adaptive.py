@@ -13,6 +13,7 @@ from tsplat.camera import Camera
 from tsplat.fit.density.control import NoControl, Schedule
 from tsplat.fit.density.gradients import ScreenGradients
 from tsplat.fit.density.rows import forget, grow, prune
+from tsplat.fit.ranks import ALONE, Ranks, own_part
 from tsplat.rasterize import Meta
 
 DENSE = 0.01          # of the extent: larger splats are split, others cloned
@@ -33,14 +34,15 @@ class AdaptiveControl(NoControl):
             has to earn its opacity anew, which removes floaters. In the `settle` steps after it the scene is not itself.
         settle: how many.
         max_splats: where more would be made, those with the largest gradients are, up to this number in all.
+        ranks: of which each has some of the splats, and acts on these; `max_splats` is of all.
     """
 
     def __init__(self, extent: float, schedule: Schedule, *, threshold: float | None = None, absgrad: bool = False,
-                 reset_every: int = 3000, settle: int = 500, max_splats: int | None = None) -> None:
-        self.extent, self.schedule = extent, schedule
+                 reset_every: int = 3000, settle: int = 500, max_splats: int | None = None, ranks: Ranks = ALONE) -> None:
+        self.extent, self.schedule, self.ranks = extent, schedule, ranks
         self.threshold = (8e-4 if absgrad else 2e-4) if threshold is None else threshold
         self.reset_every, self.settle, self.max_splats = reset_every, settle, max_splats
-        self.gradients = ScreenGradients(absgrad)
+        self.gradients = ScreenGradients(absgrad, ranks.count)
 
     def probes(self, scene: nn.Module, step: int, cameras: int = 1) -> dict[str, Tensor]:
         """Of the screen-space gradient, up to the end of the schedule."""
@@ -68,16 +70,14 @@ class AdaptiveControl(NoControl):
             if self.reset_every and step > self.reset_every:
                 keep &= scene.get_parameter("log_scales").amax(1) <= math.log(HUGE * self.extent)
             prune(scene, optimiser, keep)
-        if self._resets(step):
+        if self._last_reset(step) > step - self.schedule.batch:
             scene.get_parameter("opacity_logits").clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
             forget(scene, optimiser, slice(None), ("opacity_logits",))
 
     def settled(self, step: int) -> bool:
         """False in the `settle` steps that begin with a reset."""
-        if not self.reset_every:
-            return True
-        last = step - step % self.reset_every
-        return not (self._resets(last) and step < last + self.settle)
+        last = self._last_reset(step)
+        return not last or step >= last + self.settle
 
     def state_dict(self) -> dict[str, Any]:
         """The sums of gradients."""
@@ -87,12 +87,13 @@ class AdaptiveControl(NoControl):
         """Take on what `state_dict` gave."""
         self.gradients.load_state_dict(saved["gradients"])
 
-    def _resets(self, step: int) -> bool:
-        return bool(self.reset_every) and step > 0 and step % self.reset_every == 0 and step < self.schedule.stop
+    def _last_reset(self, step: int) -> int:
+        """The step of the last reset up to `step`; 0: there was none."""
+        return max(0, self.schedule.last(step, self.reset_every)) if self.reset_every else 0
 
     def _parents(self, scene: nn.Module) -> Tensor:
         means = scene.get_parameter("means")
-        norms = self.gradients.mean(len(means), means.detach())
+        norms, own = self.ranks.gather(self.gradients.mean(len(means), means.detach()))
         parents = (norms > self.threshold).nonzero()[:, 0]
-        room = len(parents) if self.max_splats is None else max(0, self.max_splats - len(means))
-        return parents if len(parents) <= room else parents[norms[parents].topk(room).indices].sort().values
+        room = len(parents) if self.max_splats is None else max(0, self.max_splats - len(norms))
+        return own_part(parents if len(parents) <= room else parents[norms[parents].topk(room).indices].sort().values, own)

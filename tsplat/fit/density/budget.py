@@ -13,6 +13,7 @@ from tsplat.camera import Camera
 from tsplat.fit.density.control import NoControl, Schedule
 from tsplat.fit.density.gradients import ScreenGradients
 from tsplat.fit.density.rows import grow, prune
+from tsplat.fit.ranks import ALONE, Ranks, own_part
 from tsplat.rasterize import Meta
 
 MIN_OPACITY = 0.005
@@ -35,11 +36,13 @@ class Budget(NoControl):
         schedule: when to act.
         max_splats: at the end of the schedule.
         recycled: part of the splats.
+        ranks: of which each has some of the splats. They see the scores of all (`Ranks.gather`), so that those go and are cloned or split that one
+            process would choose, wherever they are; the budget is of all.
     """
 
-    def __init__(self, extent: float, schedule: Schedule, max_splats: int, recycled: float = RECYCLED) -> None:
-        self.extent, self.schedule, self.max_splats, self.recycled = extent, schedule, max_splats, recycled
-        self.gradients = ScreenGradients(absolute=True)
+    def __init__(self, extent: float, schedule: Schedule, max_splats: int, recycled: float = RECYCLED, ranks: Ranks = ALONE) -> None:
+        self.extent, self.schedule, self.max_splats, self.recycled, self.ranks = extent, schedule, max_splats, recycled, ranks
+        self.gradients = ScreenGradients(absolute=True, batch=ranks.count)
         self.first: int | None = None             # splats before the first action
 
     def probes(self, scene: nn.Module, step: int, cameras: int = 1) -> dict[str, Tensor]:
@@ -51,9 +54,11 @@ class Budget(NoControl):
         self.gradients.observe(meta, camera)
 
     def growth(self, scene: nn.Module, step: int) -> int:
-        """Up to the number that is due."""
-        n = len(scene.get_parameter("means"))
-        return max(0, self._target(n, step) - n) if self.schedule.due(step) else 0
+        """Up to the number that is due; of several ranks, the even share of one."""
+        if not self.schedule.due(step):
+            return 0
+        n = self.ranks.total(len(scene.get_parameter("means")))
+        return max(0, math.ceil((self._target(n, step) - n) / self.ranks.count))
 
     @torch.no_grad()
     def update(self, scene: nn.Module, optimiser: Optimizer, step: int, generator: torch.Generator) -> None:
@@ -61,22 +66,24 @@ class Budget(NoControl):
         if not self.schedule.due(step):
             return
         means = scene.get_parameter("means")
-        n = len(means)
-        target = self._target(n, step)
-        self.first = self.first if self.first is not None else n
-        scores = self.gradients.mean(n, means)
-        seen = self.gradients.seen(n, means)
+        scores = self.gradients.mean(len(means), means)
+        seen = self.gradients.seen(len(means), means)
         self.gradients.clear()
         faint = scene.get_parameter("opacity_logits").sigmoid() < MIN_OPACITY
-        worth = scores.where(seen, torch.inf).masked_fill(faint, -1.0)
-        dropped = max(int(faint.sum()), min(int(self.recycled * n), int((seen | faint).sum())), n - target)
-        rows = prune(scene, optimiser, worth.argsort(stable=True).argsort() >= dropped)
+        worth, own = self.ranks.gather(scores.where(seen, torch.inf).masked_fill(faint, -1.0))      # -1: faint, infinite: neither seen nor faint
+        n, faints, judged = len(worth), int((worth == -1).sum()), int((worth < torch.inf).sum())
+        target = self._target(n, step)
+        self.first = self.first if self.first is not None else n
+        dropped = max(faints, min(int(self.recycled * n), judged), n - target)
+        rows = prune(scene, optimiser, (worth.argsort(stable=True).argsort() >= dropped)[own])
         scores = scores[rows]
-        while 0 < len(scores) < target:           # more than one round where more is missing than there are splats
-            parents = scores.topk(min(len(scores), target - len(scores))).indices
+        everyone, own = self.ranks.gather(scores)
+        while 0 < len(everyone) < target:         # more than one round where more is missing than there are splats
+            parents = own_part(everyone.topk(min(len(everyone), target - len(everyone))).indices, own)
             split = scene.get_parameter("log_scales")[parents].amax(1) > math.log(CLONED * self.extent)
             rows = grow(scene, optimiser, parents, split, generator)
             scores = scores[rows] / 2
+            everyone, own = self.ranks.gather(scores)
 
     def state_dict(self) -> dict[str, Any]:
         """The sums of gradients, and between which numbers of splats it goes."""

@@ -14,20 +14,28 @@ from tsplat.camera import Camera
 
 @dataclass(frozen=True)
 class Schedule:
-    """Act after the steps that are multiples of `every`, from `start` on and before `stop` (counted from 1)."""
+    """Act after the steps that are multiples of `every`, from `start` on and before `stop` (counted from 1).
+
+    Where a loop counts several steps at a time, `batch`, it acts when it came to or past one of these.
+    """
 
     start: int
     stop: int
     every: int
+    batch: int = 1
 
     def due(self, step: int) -> bool:
         """Whether to act after `step` steps."""
-        return self.start <= step < self.stop and step % self.every == 0
+        return self.last(step, self.every) > max(self.start - 1, step - self.batch)
+
+    def last(self, step: int, every: int) -> int:
+        """The last multiple of `every` up to `step` and before `stop`."""
+        return min(step, self.stop - 1) // every * every
 
     def part(self, step: int) -> float:
         """Which part of the actions is behind after that of `step`: above 0, and 1 for the last."""
         first, last = -(-self.start // self.every), (self.stop - 1) // self.every
-        return min(1.0, (step // self.every - first + 1) / max(1, last - first + 1))
+        return min(1.0, (self.last(step, self.every) // self.every - first + 1) / max(1, last - first + 1))
 
 
 class Control(Protocol):

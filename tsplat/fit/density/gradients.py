@@ -14,10 +14,11 @@ class ScreenGradients:
 
     Args:
         absolute: sum |dL/dmean2d| over pixels (AbsGS, Ye et al. 2024), where opposite pulls do not cancel.
+        batch: photos whose mean loss is minimised; gradients are multiplied by it, to be those of one photo's.
     """
 
-    def __init__(self, absolute: bool) -> None:
-        self.absolute = absolute
+    def __init__(self, absolute: bool, batch: int = 1) -> None:
+        self.absolute, self.batch = absolute, batch
         self.total: Tensor | None = None      # [N]
         self.views: Tensor | None = None      # [N]
         self._probe: Tensor | None = None
@@ -33,7 +34,7 @@ class ScreenGradients:
         probe, self._probe = self._probe, None
         if probe is None or probe.grad is None:
             return
-        half = probe.new_tensor([camera.width / 2, camera.height / 2])
+        half = probe.new_tensor([camera.width / 2, camera.height / 2]) * self.batch
         norms, visible = (probe.grad * half).norm(dim=-1).sum(0), meta.visible.sum(0).to(probe)
         if self.total is None or self.views is None or len(self.total) != len(norms):
             self.total, self.views = norms, visible

@@ -11,6 +11,7 @@ from torch.optim import Optimizer
 
 from tsplat.fit.density.control import NoControl, Schedule
 from tsplat.fit.density.rows import forget, take_rows, turned
+from tsplat.fit.ranks import ALONE, Ranks, even
 
 MIN_OPACITY = 0.005
 MAX_COPIES = 51       # of one splat in one action; equation 9 is a sum of that many binomials
@@ -28,15 +29,19 @@ class MCMC(NoControl):
         schedule: when to relocate and grow; in the paper after every 100th step from 500 to 25,000.
         max_splats: grow by 5 % at a time up to this number.
         noise: of the means, per learning rate of theirs.
+        ranks: of which each has some of the splats. Dead ones become copies of living ones of the same rank, and each rank grows by the same number:
+            with blocks of a like mix of splats, as ranks have, that is as drawing from all.
     """
 
-    def __init__(self, schedule: Schedule, max_splats: int, noise: float = NOISE) -> None:
-        self.schedule, self.max_splats, self.noise = schedule, max_splats, noise
+    def __init__(self, schedule: Schedule, max_splats: int, noise: float = NOISE, ranks: Ranks = ALONE) -> None:
+        self.schedule, self.max_splats, self.noise, self.ranks = schedule, max_splats, noise, ranks
 
     def growth(self, scene: nn.Module, step: int) -> int:
-        """5 %, up to the cap."""
-        n = len(scene.get_parameter("means"))
-        return max(0, min(self.max_splats, int(GROWTH * n)) - n) if self.schedule.due(step) else 0
+        """5 %, up to the cap; of several ranks, the share of this one."""
+        if not self.schedule.due(step):
+            return 0
+        n = self.ranks.total(len(scene.get_parameter("means")))
+        return even(max(0, min(self.max_splats, int(GROWTH * n)) - n), self.ranks.count)[self.ranks.rank]
 
     @torch.no_grad()
     def update(self, scene: nn.Module, optimiser: Optimizer, step: int, generator: torch.Generator) -> None:

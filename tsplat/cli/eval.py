@@ -16,7 +16,7 @@ USAGE = "tsplat eval SCENE DATA [options]"
 DESCRIPTION = """
 Measure a scene against the held-out photos of a capture. What is not given here
 is taken from the config.json beside the scene, if there is one: then the result
-is what metrics.json says.
+is what metrics.json says, but for refined poses, which the files do not hold.
 """
 EXAMPLES = """
   tsplat eval out/scene.ply capture

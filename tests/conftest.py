@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +18,9 @@ import pytest
 from backends import BACKENDS, KERNELS, Backend
 
 from tsplat.rasterize import TILE
+
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:           # as in the background of a shell; programs that tests start would ignore it, too
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 HERE = Path(__file__).resolve().parent
 

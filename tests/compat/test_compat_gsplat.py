@@ -183,7 +183,8 @@ def test_covariances_and_harmonics_are_the_recorded_ones(shared: Path, dtype: to
         assert_close([out, *found], [units[f"f64_{k}{degree}"] for k in ("out", "v_dirs", "v_coeffs")], tolerance)
     mask = torch.arange(200).view(2, 100) % 3 > 0
     masked = spherical_harmonics(4, dirs, coeffs.expand(2, -1, -1, -1), masks=mask)
-    assert torch.equal(masked, torch.where(mask[..., None], out, 0.0))
+    assert (masked[~mask] == 0).all()
+    assert_close(masked, torch.where(mask[..., None], out, 0.0), 25 * torch.finfo(dtype).eps)      # 25 products, summed for fewer splats: rounded anew
 
 
 @pytest.mark.parametrize("name", ["tiny", "basic"])

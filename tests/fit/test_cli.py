@@ -69,7 +69,7 @@ def test_fit_from_the_outside_is_interrupted_and_goes_on(capture_folder: Path, t
         while not (tmp_path / "checkpoint.pt").exists() and process.poll() is None:
             time.sleep(0.02)
         process.send_signal(signal.SIGINT)
-        error = process.communicate()[1]
+        error = process.communicate(timeout=120)[1]
     assert process.returncode == 130
     found = re.fullmatch(r"tsplat: stopped after step (\d+) of 100000; the same call goes on from (.*)\n", error)
     assert found, error                                                    # one line: no traceback, and no progress bar in a pipe

@@ -238,7 +238,7 @@ def test_the_real_program_is_watched_and_ends_by_ctrl_c(browser: Any, capture_fo
         screen.tab.get_by_role("button", name="Pause").click()
         screen.until(lambda: screen.tab.get_by_role("button", name="Go on").count(), "the pause")
         process.send_signal(signal.SIGINT)
-        error = process.communicate()[1]
+        error = process.communicate(timeout=120)[1]
         screen.tab.close()
     assert process.returncode == 130
     assert re.fullmatch(r"tsplat: stopped after step \d+ of 100000; the same call goes on from .*checkpoint.pt\n", error)

@@ -58,7 +58,7 @@ def test_view_says_where_serves_the_page_and_ends_by_ctrl_c(options: list[str], 
         with pytest.raises(OSError):                                   # at this address alone
             socket.create_connection(("127.0.0.2", int(found[2])), timeout=5)
         process.send_signal(signal.SIGINT)
-        out, error = process.communicate()
+        out, error = process.communicate(timeout=120)
     assert (process.returncode, out, error) == (130, "", "tsplat: interrupted\n")
 
 

@@ -184,7 +184,7 @@ def test_covariances_and_harmonics_are_the_recorded_ones(shared: Path, dtype: to
     mask = torch.arange(200).view(2, 100) % 3 > 0
     masked = spherical_harmonics(4, dirs, coeffs.expand(2, -1, -1, -1), masks=mask)
     assert (masked[~mask] == 0).all()
-    assert_close(masked, torch.where(mask[..., None], out, 0.0), 25 * torch.finfo(dtype).eps)      # 25 products, summed for fewer splats: rounded anew
+    assert_close(masked, torch.where(mask[..., None], out, 0.0), 25 * torch.finfo(dtype).eps)      # 25 products, of fewer splats: rounded anew
 
 
 @pytest.mark.parametrize("name", ["tiny", "basic"])

@@ -18,6 +18,7 @@ import pytest
 from backends import BACKENDS, KERNELS, Backend
 
 from tsplat.rasterize import TILE
+from tsplat.scene import Capture, load_capture, write_synthetic_capture
 
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:           # as in the background of a shell; programs that tests start would ignore it, too
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -55,3 +56,19 @@ def shared() -> Path:
 def _same_start() -> None:
     """The same seed for every test, whatever ran before. (`test_parallel.py` and tests of chunks take more threads than one explicitly.)"""
     torch.manual_seed(0)
+
+
+@pytest.fixture(scope="session")
+def capture_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """8 photos of 32x24 with 3000 points."""
+    return write_synthetic_capture(tmp_path_factory.mktemp("capture"), views=8, size=(32, 24))
+
+
+@pytest.fixture
+def capture(capture_folder: Path) -> Capture:
+    """The same, loaded, with 200 of the points; photos 0 and 4 are held out."""
+    capture = load_capture(capture_folder, test_every=4)
+    assert capture.points is not None
+    assert capture.point_colors is not None
+    capture.points, capture.point_colors = capture.points[:200], capture.point_colors[:200]
+    return capture

@@ -35,7 +35,7 @@ def capture(capture_folder: Path, tmp_path: Path) -> Path:
 
 def test_every_command_without_home_or_locale(capture: Path, tmp_path: Path) -> None:
     """As `env -i` with LC_ALL=C leaves it, from a folder of its own, on odd names. Nothing is written but what is asked for."""
-    pytest.importorskip("imageio_ffmpeg")
+    pytest.importorskip("imageio_ffmpeg", reason="an MP4 needs imageio-ffmpeg: pip install 'tsplat[video]'")
     here, out = tmp_path / "here", capture.parent / "größer 1"
     here.mkdir()
     before = listing(capture)

@@ -77,7 +77,7 @@ def test_clips_along_a_path(scene: Path, capture_folder: Path, tmp_path: Path, c
     assert run("render", scene, *path, "--size", "16x12", "--mode", "normals", "-o", tmp_path / "p.png") == 0
     assert sorted(p.name for p in tmp_path.glob("p_*")) == [f"p_{i:03d}.png" for i in range(5)]
     assert read_image(tmp_path / "p_004.png").shape == (12, 16, 3)
-    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="an MP4 needs imageio-ffmpeg: pip install 'tsplat[video]'")
     assert run("render", scene, "--orbit", 3, "--size", "41x31", "-o", tmp_path / "a.mp4") == 0
     reader = ffmpeg.read_frames(str(tmp_path / "a.mp4"))
     assert next(reader)["size"] == (40, 30)

@@ -81,7 +81,7 @@ def test_gif_of_bad_frames(tmp_path: Path, name: str, frames: list[torch.Tensor]
 def test_frames_are_not_held(tmp_path: Path, name: str) -> None:
     """At most the one that is written, and the first, which tells the size, while the next is made."""
     if name.endswith("mp4"):
-        pytest.importorskip("imageio_ffmpeg")
+        pytest.importorskip("imageio_ffmpeg", reason="an MP4 needs imageio-ffmpeg: pip install 'tsplat[video]'")
     alive: list[weakref.ref[Tensor]] = []
     most = 0
 
@@ -101,7 +101,7 @@ def test_frames_are_not_held(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize("name", ["a.gif", "a.mp4"])
 def test_an_older_clip_stays_until_the_new_one_is_whole(tmp_path: Path, name: str) -> None:
     if name.endswith("mp4"):
-        pytest.importorskip("imageio_ffmpeg")
+        pytest.importorskip("imageio_ffmpeg", reason="an MP4 needs imageio-ffmpeg: pip install 'tsplat[video]'")
     (tmp_path / name).write_text("old")
 
     def broken() -> Iterator[Tensor]:
@@ -123,7 +123,7 @@ def test_an_older_clip_stays_until_the_new_one_is_whole(tmp_path: Path, name: st
 
 def test_another_reader_of_gifs(tmp_path: Path) -> None:
     """ffmpeg's; the means of dithered pixels are right to a twelfth of a step between two colours, 1/6 to 1/5 apart."""
-    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="an MP4 needs imageio-ffmpeg: pip install 'tsplat[video]'")
     write_clip(tmp_path / "a.gif", (color.expand(32, 48, 3) for color in COLORS), fps=20)
     reader = ffmpeg.read_frames(str(tmp_path / "a.gif"))
     about = next(reader)
@@ -136,7 +136,7 @@ def test_another_reader_of_gifs(tmp_path: Path) -> None:
 
 def test_mp4(tmp_path: Path) -> None:
     """H.264, yuv420p, an even size; colours as a player decodes them, to the steps of 8 bits of brightness and colour."""
-    ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    ffmpeg = pytest.importorskip("imageio_ffmpeg", reason="an MP4 needs imageio-ffmpeg: pip install 'tsplat[video]'")
     path = tmp_path / "a: fähre" / "clip one.mp4"
     path.parent.mkdir()
     write_clip(path, (color.expand(33, 47, 3) for color in COLORS), fps=12.5)
@@ -149,7 +149,7 @@ def test_mp4(tmp_path: Path) -> None:
     assert about["fps"] == 12.5
     frames = [torch.frombuffer(bytearray(data), dtype=torch.uint8).view(32, 46, 3).float() / 255 for data in reader]
     assert len(frames) == len(COLORS)
-    for frame, color in zip(frames, COLORS, strict=True):
+    for frame, color in zip(frames, COLORS, strict=True):           # half a step of Y (0.6/255) and of Cb or Cr (1.1), and of 8 bits in and out
         torch.testing.assert_close(frame, color.expand(32, 46, 3), atol=3 / 255, rtol=0)
 
 
@@ -159,7 +159,7 @@ def test_mp4(tmp_path: Path) -> None:
     ([torch.zeros(4, 4, 3), torch.zeros(4, 6, 3)], 25.0, r"^frames: expected shape \[4, 4, 3\]; got \[4, 6, 3\]"),
 ])
 def test_mp4_of_bad_frames(tmp_path: Path, frames: list[Tensor], fps: float, message: str) -> None:
-    pytest.importorskip("imageio_ffmpeg")
+    pytest.importorskip("imageio_ffmpeg", reason="an MP4 needs imageio-ffmpeg: pip install 'tsplat[video]'")
     with pytest.raises(ValueError, match=message):
         write_clip(tmp_path / "a.mp4", frames, fps)
     assert not list(tmp_path.iterdir())

@@ -121,7 +121,7 @@ def test_a_short_path_takes_every_other_photo(capture: Capture) -> None:
 def test_a_path_keeps_to_photos_to_train_on(capture: Capture) -> None:
     capture = Capture(**{**vars(capture), "train": [0, 2], "test": list(range(3, 12))})
     at = eyes(capture_path(capture, 5))
-    torch.testing.assert_close(at[[0, -1]], eyes([capture.camera(0), capture.camera(2)]), atol=1e-5, rtol=0)
+    torch.testing.assert_close(at[[0, -1]], eyes([capture.camera(0), capture.camera(2)]), atol=1e-5, rtol=0)      # float32 at 3, through an inverse
     with pytest.raises(ValueError, match="^frames: expected at least 1; got 0"):
         capture_path(capture, 0)
     alone = Capture(**{**vars(capture), "train": [7], "test": []})

@@ -241,7 +241,7 @@ def playbot(data_root: Path) -> Gaussians:
 @pytest.mark.parametrize("version", [3, 4])
 def test_real_spz(data_root: Path, playbot: Gaussians, version: int) -> None:
     if version == 4:
-        pytest.importorskip("zstandard")
+        pytest.importorskip("zstandard", reason=".spz of version 4 needs zstandard: pip install 'tsplat[spz]'")
     loaded = Gaussians.load(data_root / "splats" / f"playbot_lod3_31k.v{version}.spz")
     clamped = Gaussians(playbot.means, playbot.quats, playbot.log_scales, playbot.opacity_logits, playbot.sh0.clamp(-0.5 / 0.15, 0.5 / 0.15),
                         playbot.sh_rest.clamp(-1, 1))
@@ -330,7 +330,7 @@ def test_small_fixtures(data_root: Path) -> None:
 
 def test_small_fixture_of_version_4(data_root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     folder = data_root / "splats" / "fixtures"
-    pytest.importorskip("zstandard")
+    pytest.importorskip("zstandard", reason=".spz of version 4 needs zstandard: pip install 'tsplat[spz]'")
     old, new = (Gaussians.load(folder / f"minimal-v{version}.spz") for version in (3, 4))
     assert differences(old, new) == dict.fromkeys(differences(old, old), 0.0)
     monkeypatch.setitem(sys.modules, "zstandard", None)

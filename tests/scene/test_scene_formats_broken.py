@@ -132,7 +132,7 @@ def test_spz_bombs(tmp_path: Path) -> None:
 
 
 def test_spz_frames(tmp_path: Path) -> None:
-    zstandard = pytest.importorskip("zstandard")
+    zstandard = pytest.importorskip("zstandard", reason=".spz of version 4 needs zstandard: pip install 'tsplat[spz]'")
     path = tmp_path / "a.spz"
     sizes = (36, 4, 12, 12, 16)
 

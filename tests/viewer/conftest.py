@@ -1,14 +1,13 @@
-"""Shared by the tests of the viewer: scenes of a few splats, a tiny capture, and a way to wait that says for what it waited."""
+"""Shared by the tests of the viewer: scenes of a few splats, and a way to wait that says for what it waited."""
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
 
 from tsplat import Camera
-from tsplat.scene import Capture, Gaussians, Spheres, load_capture, write_synthetic_capture
+from tsplat.scene import Gaussians, Spheres
 
 PATIENCE = 60.0             # seconds; a slow machine must not fail, and what never comes must not hang
 
@@ -34,22 +33,6 @@ def spheres() -> Spheres:
 def camera() -> Camera:
     """Looks at the origin, up being -y."""
     return Camera.look_at((0.5, -1.0, -3.0), (0.0, 0.0, 0.0), width=48, height=32)
-
-
-@pytest.fixture(scope="session")
-def capture_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """8 photos of 32x24 with 3000 points."""
-    return write_synthetic_capture(tmp_path_factory.mktemp("capture"), views=8, size=(32, 24))
-
-
-@pytest.fixture
-def capture(capture_folder: Path) -> Capture:
-    """The same, loaded, with 200 of the points; photos 0 and 4 are held out."""
-    capture = load_capture(capture_folder, test_every=4)
-    assert capture.points is not None
-    assert capture.point_colors is not None
-    capture.points, capture.point_colors = capture.points[:200], capture.point_colors[:200]
-    return capture
 
 
 @pytest.fixture(scope="session")

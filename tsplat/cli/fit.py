@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> None:
 def _synthetic(folder: Path, group: ProcessGroup | None) -> Path:
     """The capture of a made-up scene, which the first process renders, if need be."""
     if torchrun.rank() == 0 and not (folder / "sparse" / "0" / "points3D.txt").exists():              # the file that is written last
-        print(f"rendering a small capture of a made-up scene to {folder}")
+        print(f"rendering photos of a made-up scene to {folder / 'images'}", flush=True)
         write_synthetic_capture(folder)
     if group is not None:
         torch.distributed.barrier(group)

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from tsplat.camera import Camera
-from tsplat.cli.common import SCENE, add_device, device_of
+from tsplat.cli.common import AXES, SCENE, add_device, device_of
 from tsplat.pictures import CLIPS, FPS, MODES, capture_path, check_clip, depth_range, draw_layers, orbit, picture, write_clip
 from tsplat.pictures.modes import Scene
 from tsplat.scene import load_capture, load_scene, write_image
@@ -28,7 +28,6 @@ EXAMPLES = """
   tsplat render scene.ply -o turn.gif --orbit 60 --mode normals
   tsplat render scene.ply -o fly.mp4 --path capture --frames 240
 """
-AXES = {sign + axis: tuple(float(f"{sign}1") * (axis == a) for a in "xyz") for sign in ("", "-") for axis in "xyz"}
 SIZE = (800, 600)
 MOST = 16384                         # pixels along a side: 3 GB of colours in float32. Beyond, systems kill a program rather than refuse it memory
 FRAMES = 120

@@ -5,8 +5,7 @@ from __future__ import annotations
 import argparse
 import time
 
-from tsplat.cli.common import SCENE, add_device, device_of
-from tsplat.cli.render import AXES
+from tsplat.cli.common import AXES, SCENE, add_device, device_of
 from tsplat.scene import Spheres, load_capture, load_scene
 from tsplat.viewer import RenderLoop, Settings, Views, draw_view
 

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 from collections.abc import Iterable
 from pathlib import Path
 
 from torch import Tensor
 
-from tsplat.checks import check_tensor
-from tsplat.pictures.gif import write_gif
+from tsplat.pictures.gif import sized, write_gif
 from tsplat.scene.files import replacing
 from tsplat.scene.image_files import to_bytes
 
@@ -63,21 +61,16 @@ def _write_mp4(path: Path, frames: Iterable[Tensor], fps: float) -> None:
 
     if not 0 < fps <= 1000:
         raise ValueError(f"fps: expected above 0 and up to 1000 frames per second; got {fps}")
-    frames = iter(frames)
-    first = next(frames, None)
-    if first is None:
-        raise ValueError("frames: expected at least 1 frame; got none")
-    check_tensor("frames", first, ("H", "W", 3))
-    height, width = (side // 2 * 2 for side in first.shape[:2])
+    rows, columns, frames = sized(frames)
+    height, width = rows // 2 * 2, columns // 2 * 2
     if not min(height, width):
-        raise ValueError(f"frames: expected at least 2x2 pixels in an MP4; got {first.shape[1]}x{first.shape[0]}")
+        raise ValueError(f"frames: expected at least 2x2 pixels in an MP4; got {columns}x{rows}")
     with replacing(path) as temporary:
         name = f"file:{temporary}"                     # lest ffmpeg take what is before a colon for a protocol
         writer = write_frames(name, (width, height), fps=fps, ffmpeg_log_level="fatal", output_params=list(OUTPUT), **H264)
         writer.send(None)
         try:
-            for frame in itertools.chain([first], frames):
-                check_tensor("frames", frame, (*first.shape[:2], 3))
+            for frame in frames:
                 pixels = to_bytes(frame[:height, :width]).contiguous().numpy()
                 try:
                     writer.send(pixels)

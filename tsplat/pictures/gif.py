@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import os
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
 import torch
@@ -36,22 +36,32 @@ def write_gif(path: str | os.PathLike[str], frames: Iterable[Tensor], fps: float
         raise ValueError(f"{os.fspath(path)}: expected a file name that ends in .gif")
     if not 0 < fps <= 100:
         raise ValueError(f"fps: expected above 0 and up to 100 frames per second in a GIF; got {fps}")
-    frames = iter(frames)
-    first = next(frames, None)
-    if first is None:
-        raise ValueError("frames: expected at least 1 frame; got none")
-    check_tensor("frames", first, ("H", "W", 3))
-    height, width = first.shape[:2]
+    height, width, frames = sized(frames)
     if not 1 <= min(height, width) <= max(height, width) < 1 << 16:
         raise ValueError(f"frames: expected 1 to 65535 pixels a side; got {width}x{height}")
     control = struct.pack("<BBBBHBB", 0x21, 0xF9, 4, 0, round(100 / fps), 0, 0)
     place = struct.pack("<BHHHHBB", 0x2C, 0, 0, width, height, 0, 8)
     with replacing(path) as temporary, temporary.open("wb") as file:
         file.write(b"GIF89a" + struct.pack("<HHBBB", width, height, 0xF7, 0, 0) + _palette() + b"\x21\xFF\x0BNETSCAPE2.0\x03\x01\x00\x00\x00")
-        for frame in itertools.chain([first], frames):
-            check_tensor("frames", frame, (height, width, 3))
+        for frame in frames:
             file.write(control + place + _blocks(_lzw(_indices(frame))) + b"\x00")
         file.write(b"\x3B")
+
+
+def sized(frames: Iterable[Tensor]) -> tuple[int, int, Iterator[Tensor]]:
+    """Height and width of the first frame `[H, W, 3]`, and all frames, each checked when it is taken: ValueError if it is of another size."""
+    frames = iter(frames)
+    first = next(frames, None)
+    if first is None:
+        raise ValueError("frames: expected at least 1 frame; got none")
+    check_tensor("frames", first, ("H", "W", 3))
+
+    def checked() -> Iterator[Tensor]:
+        for frame in itertools.chain([first], frames):
+            check_tensor("frames", frame, (*first.shape[:2], 3))
+            yield frame
+
+    return first.shape[0], first.shape[1], checked()
 
 
 def _palette() -> bytes:

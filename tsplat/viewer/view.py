@@ -15,6 +15,7 @@ from tsplat.checks import check_choice
 from tsplat.pictures import MODES, Mode, draw_layers, picture
 from tsplat.pictures.modes import Scene
 from tsplat.scene import Gaussians, Spheres
+from tsplat.scene.image_files import to_bytes
 
 Pixels: TypeAlias = NDArray[np.uint8]
 
@@ -57,7 +58,7 @@ def draw_view(scene: Scene, camera: Camera, settings: Settings) -> Pixels:
     camera = camera.to(scene.device)
     layers = draw_layers(_as_chosen(scene, settings), camera, depth=settings.mode not in ("color", "alpha"), antialiased=settings.antialiased)
     image = picture(layers, camera, settings.mode, background=torch.tensor(settings.background, device=scene.device))
-    pixels: Pixels = image.mul(255).round().to(torch.uint8).cpu().numpy()
+    pixels: Pixels = to_bytes(image).numpy()
     return pixels
 
 

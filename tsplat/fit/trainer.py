@@ -115,7 +115,7 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
         FloatingPointError: a loss or gradient that is not finite, naming the step, the photo and the parameter. The last
             checkpoint stays; if there is none yet, one is written.
         MemoryError: density control would take more memory than is free; before it does. As above.
-        NotImplementedError: what a primitive does not have (depth maps for spheres), what several ranks do not (spheres, turntables).
+        NotImplementedError: what a primitive does not have (depth maps for spheres), what several ranks do not (spheres, offloading, turntables).
         OSError: a file cannot be written. The last checkpoint stays.
         KeyboardInterrupt: on Ctrl-C, after the step and a checkpoint; its message says where it is.
     """

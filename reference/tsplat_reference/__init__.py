@@ -1,5 +1,6 @@
 """Pure-torch splat rendering, stage by stage: the CPU path of tsplat and the oracle of its kernels. Imports torch only."""
 
+from tsplat_reference.allocator import keep_freed_memory
 from tsplat_reference.binning import Bins as Bins
 from tsplat_reference.binning import bin_splats as bin_splats
 from tsplat_reference.binning import tile_counts as tile_counts
@@ -25,3 +26,5 @@ from tsplat_reference.spheres import Outlines as Outlines
 from tsplat_reference.spheres import SphereImages as SphereImages
 from tsplat_reference.spheres import blend_spheres as blend_spheres
 from tsplat_reference.spheres import outlines as outlines
+
+keep_freed_memory()

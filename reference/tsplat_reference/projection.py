@@ -15,8 +15,9 @@ from tsplat_reference.constants import ALPHA_MIN, COMPENSATION_MIN, LARGEST
 from tsplat_reference.parallel import map_chunks
 from tsplat_reference.planes import Matrix, Plane, Vector, cross, dot, join, matmul, split, total, transpose
 
-CHUNK = 1 << 15
-"""Splats projected at a time where no graph is recorded, so that the planes (about 100 per camera) stay in the cache."""
+CHUNK = 1 << 17
+"""Splats projected at a time where no graph is recorded: about 100 planes per camera, 50 MB in float32. Fewer would cost more calls, which
+wait for each other in Python: 2^15 takes 1.3 to 1.8 times as long."""
 
 
 class Projection(NamedTuple):

@@ -20,7 +20,8 @@ TARGETS = ["sm_80", "sm_86", "sm_89", "sm_90", "sm_100", "sm_120", "gfx942", "gf
 def test_no_kernel_spills(target: str, tmp_path: Path) -> None:
     environment = {**os.environ, "TRITON_CACHE_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "reference")])}
     environment.pop("TRITON_INTERPRET", None)
-    run = subprocess.run([sys.executable, "-W", "ignore", str(ROOT / "bench" / "sass.py"), "--json", "--quick", "--targets", target],
+    strict = "-W", "ignore", "-W", "error:TRITON_DEFAULT_FP_FUSION"          # a kernel that does not say whether to fuse
+    run = subprocess.run([sys.executable, *strict, str(ROOT / "bench" / "sass.py"), "--json", "--quick", "--targets", target],
                          capture_output=True, text=True, env=environment)
     assert run.returncode == 0, run.stderr
     kernels = json.loads(run.stdout)

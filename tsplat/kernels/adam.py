@@ -67,8 +67,8 @@ def adam_rows(parameter: Tensor, grad: Tensor, exp_avg: Tensor, exp_avg_sq: Tens
     N, K = len(parameter), parameter[0].numel()
     options = launch("adam")
     width = 1 << (K - 1).bit_length()
-    rows = max(1, options["BLOCK"] // width)
+    rows = max(1, options.pop("BLOCK") // width)
     logs = (math.log(beta) if beta else -1e30 for beta in (beta1, beta2))
     adam_rows_kernel[(ceil_div(N, rows),)](
         parameter, grad.contiguous(), exp_avg, exp_avg_sq, steps, visible.contiguous(), N, float(lr), 1 - beta1, 1 - beta2, *logs, float(eps),
-        K=K, WIDTH=width, ROWS=rows, num_warps=options["num_warps"], enable_fp_fusion=True)
+        K=K, WIDTH=width, ROWS=rows, **options)

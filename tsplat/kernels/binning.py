@@ -233,7 +233,7 @@ class _Splats:
         self.bins = ceil_div(self.tiles[0], int(SIDE.value)), ceil_div(self.tiles[1], int(SIDE.value))
         self.shapes = means2d.contiguous(), conics.contiguous(), opacities.contiguous()
         self.radii = radii.contiguous()
-        self.options = {"EPS": torch.finfo(means2d.dtype).eps, "TILE": tile, "SIDE": SIDE.value, **launch("bin"), "enable_fp_fusion": True}
+        self.options = {"EPS": torch.finfo(means2d.dtype).eps, "TILE": tile, "SIDE": SIDE.value, **launch("bin")}
         self.programs = ceil_div(self.R, self.options["BLOCK"])
         self.counts = torch.empty(self.R, dtype=torch.int32, device=means2d.device)
         self.totals = torch.zeros(2, dtype=torch.int64, device=means2d.device)

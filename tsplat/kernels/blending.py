@@ -273,7 +273,7 @@ class _Scene:
             means2d.contiguous(), self.conics, self.opacities, self.colors, self.records, self.R, max(self.rows, 1),
             D=self.D if self.D <= CHANNELS else 0, **options)
         target = current_target()
-        self.common = {"ALPHA_MAX": alpha_max, "DROP_LAST": drop_last, "log2_alpha": footprint.log2_alpha, "enable_fp_fusion": True}
+        self.common = {"ALPHA_MAX": alpha_max, "DROP_LAST": drop_last, "log2_alpha": footprint.log2_alpha}
         lanes, ptx = target.lanes, target.ptx and means2d.dtype == torch.float32
         self.predicates = target.predicates
         self.lane_x, self.blocks = lane_x(lanes, means2d), self.C * blocks(self.grid, lanes)

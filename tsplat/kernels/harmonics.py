@@ -262,7 +262,7 @@ def harmonics(means: Tensor, centers: Tensor, coeffs: Tensor, degree: int, mask:
     channels, chunk = _group(K, D, degree)
     harmonics_fwd_kernel[(ceil_div(N, options["BLOCK"]), D // channels)](
         means.contiguous(), centers.contiguous(), coeffs.contiguous(), mask.contiguous(), out, N, C, K=K, D=D, DEGREE=degree,
-        CHANNELS=channels, CHUNK=chunk, **options, enable_fp_fusion=True)
+        CHANNELS=channels, CHUNK=chunk, **options)
     return out
 
 
@@ -282,7 +282,7 @@ def harmonics_backward(means: Tensor, centers: Tensor, coeffs: Tensor, degree: i
     partial_centers = means.new_empty(groups * programs, C, 4) if cameras else None
     harmonics_bwd_kernel[(programs, groups)](
         means, centers, coeffs, mask.contiguous(), v_out.contiguous(), v_means, v_coeffs, partial_centers, N, C, K=K, D=D,
-        DEGREE=degree, CHANNELS=channels, CHUNK=chunk, **options, enable_fp_fusion=True)
+        DEGREE=degree, CHANNELS=channels, CHUNK=chunk, **options)
     if degree == 0:
         return torch.zeros_like(means), no_centers, v_coeffs
     v_centers = no_centers if partial_centers is None else -partial_centers.sum(0)[:, :3]

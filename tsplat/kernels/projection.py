@@ -329,7 +329,7 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
             means.contiguous(), *map(_contiguous, (quats, scales, covars)), opacities.contiguous(), viewmats.contiguous(),
             Ks.contiguous(), radii, means2d, depths, conics, compensations, N, C, width, height, near, far, eps2d, MODEL=model,
             ANTIALIASED=antialiased, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, ALPHA_MIN=ALPHA_MIN, LARGEST=LARGEST,
-            **options, enable_fp_fusion=True)
+            **options)
     return radii, means2d, depths, conics, compensations
 
 
@@ -352,7 +352,7 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
             means, quats, scales, covars, viewmats, Ks, radii.contiguous(), v_means2d.contiguous(), _contiguous(v_depths),
             v_conics.contiguous(), _contiguous(v_compensations if antialiased else None), v_means, v_quats, v_scales, v_covars, partials, N,
             C, width, height, eps2d, MODEL=model, MARGIN=FRUSTUM_MARGIN, FLOOR=COMPENSATION_MIN, LARGEST=LARGEST, SUMS=SUMS,
-            **options, enable_fp_fusion=True)
+            **options)
         if partials is not None:
             sums = partials.sum(0)                      # [C, SUMS]
             v_viewmats[:, :3] = sums[:, :12].view(C, 3, 4)

@@ -45,7 +45,6 @@ another 40: 4.8 GB per rank for 40M splats in all and one camera per rank, whate
 """
 
 from tsplat.distributed.collectives import check_group as check_group
-from tsplat.distributed.exchange import Drawn as Drawn
-from tsplat.distributed.exchange import exchange as exchange
 from tsplat.distributed.exchange import send as send
 from tsplat.distributed.gathering import gather_cameras as gather_cameras
+from tsplat.distributed.projection import project as project

@@ -14,9 +14,10 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from tsplat_reference.constants import EPS2D
 
 from tsplat.camera import Camera
-from tsplat.fit.frustum import may_see
+from tsplat.ops import may_see
 from tsplat.ops.common import spread
 from tsplat.rasterize import Rendering
 from tsplat.scene import Gaussians
@@ -33,7 +34,10 @@ def draw_rows(draw: Callable[..., Rendering], gaussians: Gaussians, camera: Came
         What `draw` gave, with a `meta` of all N splats in host memory, but for the lists of the tiles: those left out are culled.
     """
     with torch.no_grad():
-        rows = may_see(gaussians.means, gaussians.log_scales.amax(1).exp(), gaussians.opacities, camera.to(gaussians.device))
+        near = camera.to(gaussians.device)
+        seen = may_see(gaussians.means, gaussians.log_scales.amax(1).exp(), gaussians.opacities, near.viewmats[None], near.Ks[None],
+                       camera.width, camera.height, camera.model, camera.near, camera.far, EPS2D)
+        rows = seen[0].nonzero()[:, 0]
     device, n = camera.viewmats.device, len(gaussians)
     rendering = draw(_Rows(gaussians, rows, device), probes={name: take(probe, rows, 1, device) for name, probe in probes.items()})
     meta = rendering.meta

@@ -26,7 +26,7 @@ splats and the drawing of the own image are in it. (Linux only, for `VmHWM`; mem
 grow with the city), SH of degree 3, float32. Per rank and step, without any overlap, in ms, with N and V in millions:
 
     frusta         0.004 N      each rank asks for N / W splats in W cameras: a byte written and read twice, 80 operations
-    host           0.2 W        launches, forward and backward, of projection and colours for each camera; an assumption
+    host           0.1 W        launches, forward and backward, of projection for each camera; an assumption
     pairs          0.45 V       projection [1], and picking rows and adding up their gradients, 1100 bytes each at 2983 GB/s [1]
     colours        0.26 V + 0.16 N / W    SH coefficients: 192 bytes, read twice and their gradient added; gradients are made dense
     exchange       0.27 V       picking, packing and spreading: 20 passes over records of 40 bytes
@@ -43,8 +43,8 @@ One rank alone has no frusta, pairs, exchange and links, and projects all: 0.12 
 Memory of a rank, in bytes: 59 x 4 x 4 N / W (parameter, gradient, two moments), N (one for each splat and camera, for a moment), 8 N where density
 control has a probe, 1000 V of rows and drawing; and 24 N instead of 9 N, for a moment, where it acts (scores of all splats, sorted). With V = 1M,
 40M splats on 16 ranks are 3.7 GB, and 1B on 64 are 24.8 GB (40 where density control acts), of which 14.8 are the splats. Before pairs were
-chosen, all N were projected, 120 N: 135 GB, which an H100 does not have, and 136 ms, where it is 33 now. From 256 ranks on, the launches for each
-camera are most of a step, and more than projecting all took for 40M splats: one launch for the pairs of all cameras is what would come next.
+chosen, all N were projected, 120 N: 135 GB, which an H100 does not have, and 136 ms, where it is 27 now. From 256 ranks on, the launches for each
+camera are most of a step, and on 64 more than projecting all 40M took (4.8 ms): one launch for the pairs of all cameras is what would come next.
 
 **The published points**, beside the model for the same numbers of splats, ranks and pixels, with at least one photo per rank and V of 4M, as V is
 not published. Ours is a model of kernels on H100s, without photos to load, loss, densification and waiting for the slowest; theirs are runs.
@@ -52,11 +52,11 @@ not published. Ours is a model of kernels on H100s, without photos to load, loss
 | who | splats | GPUs | photos a step | pixels | published | model |
 | --- | --- | --- | --- | --- | --- | --- |
 | Grendel, bicycle [3] | 6M | 1 | 1 | 4946x3286 | 5.27 photos/s | 14 photos/s |
-| Grendel, bicycle [3] | 6M | 4 | 1 | 4946x3286 | 16.7 photos/s | 54 photos/s |
-| Grendel, Rubble [4] | 40.4M | 4 | 1 | 4591x3436 | 5.55 photos/s | 51 photos/s |
-| Grendel, Rubble [4] | 40.4M | 4 | 4 | 4591x3436 | 7.28 photos/s | 51 photos/s |
-| Grendel, Rubble [4] | 40.4M | 16 | 32 | 4591x3436 | 25.18 photos/s | 206 photos/s |
-| Grendel, Rubble [4] | 40.4M | 32 | 64 | 4591x3436 | 38.03 photos/s | 388 photos/s |
+| Grendel, bicycle [3] | 6M | 4 | 1 | 4946x3286 | 16.7 photos/s | 55 photos/s |
+| Grendel, Rubble [4] | 40.4M | 4 | 1 | 4591x3436 | 5.55 photos/s | 52 photos/s |
+| Grendel, Rubble [4] | 40.4M | 4 | 4 | 4591x3436 | 7.28 photos/s | 52 photos/s |
+| Grendel, Rubble [4] | 40.4M | 16 | 32 | 4591x3436 | 25.18 photos/s | 210 photos/s |
+| Grendel, Rubble [4] | 40.4M | 32 | 64 | 4591x3436 | 38.03 photos/s | 404 photos/s |
 
 [3] Grendel (Zhao et al. 2024, arXiv 2406.18533), README of its repository, "Significantly Speed up and Reduce per-GPU memory usage on Mip360 at 4K
 Resolution": bicycle, 50,000 photos in 2 h 38 min on one A100 of 40 GB (37.2 GB used), in 50 min on 4 (10.4 GB each). N is not given: 6M, as 3DGS
@@ -64,9 +64,9 @@ makes of bicycle. [4] The same, Table 7: Rubble, A100s of 40 GB, 4 per node. The
 itself; what else that summary gives agrees with abstract and README. N of the table is not in it: 40.4M are taken, the abstract's for 16 GPUs (one
 held 11.2M).
 
-That theirs take 3 to 10 times as long is no surprise: an A100 has half the memory bandwidth of an H100; blending as 3DGS does takes 3 (forward) to 5
+That theirs take 3 to 11 times as long is no surprise: an A100 has half the memory bandwidth of an H100; blending as 3DGS does takes 3 (forward) to 5
 times (backward) as long as these kernels ([1], against gsplat); 16 Mpixel of a photo are loaded, and SSIM is taken of them, which the model does not
-have; links are slower; and an aerial view may see more than 4M. From 4 GPUs with 4 photos to 32 with 64, Grendel gains 5.2, the model 7.6, of 8.
+have; links are slower; and an aerial view may see more than 4M. From 4 GPUs with 4 photos to 32 with 64, Grendel gains 5.2, the model 7.8, of 8.
 Grendel divides images into blocks of pixels among ranks, which balances views of different cost, and lets all ranks draw one photo; here an image is
 drawn by one rank.
 
@@ -244,7 +244,7 @@ def predict(splats: float, ranks: int, visible: float, pixels: float = 1.0, phot
     """The model of the docstring; splats and visible in millions, pixels in those of 1920x1080, photos of a rank and step."""
     N, W, node, many = splats, ranks, min(ranks, 8), ranks > 1
     V, C = visible * photos, photos
-    parts = {"frusta": 0.004 * N * C * many, "host": 0.2 * W * C * many, "projection": 0.45 * V if many else 0.120 * N * C,
+    parts = {"frusta": 0.004 * N * C * many, "host": 0.1 * W * C * many, "projection": 0.45 * V if many else 0.120 * N * C,
              "colours": 0.26 * V + 0.16 * N / W, "exchange": 0.27 * V * many,
              "link": 80 * V * ((node - 1) / W / 360 + (W - node) / W / 40), "latency": 6 * (0.03 + 0.001 * (W - 1)) * many,
              "drawing": 2.14 * V * pixels, "Adam": 0.55 * N / W}

@@ -42,9 +42,10 @@ process, which decides between equal depths, so that images are those of one pro
 All ranks make the same calls in the same order. What only one rank can see (a tensor of a wrong shape) raises on that rank only; `torchrun`
 then ends the others. Under torch.compile, what differs between ranks raises without saying what.
 
-Memory: per own splat and camera of *all* ranks one byte, for a moment, and 8 for the gradient of `screen_offset` or `absgrad` where these are
-given; what is projected, and held for backward, is what a camera may see, about 1000 bytes each with the drawing (`bench/distributed.py`, which
-measures it and says what 40M and 1B splats take). Fisheye cameras may see all in front of them: of these pairs, 100 bytes each are held.
+Memory: per own splat and camera of *all* ranks one byte, for a moment, and 8 for the gradient of `screen_offset` or `absgrad` where these are given;
+what is projected, and held for backward, is what a camera may see, about 1000 bytes each with the drawing (`bench/distributed.py`, which measures it
+and says what 40M and 1B splats take). Fisheye cameras may see all in front of them: of these pairs, 100 bytes each are held. The drop-in for gsplat
+projects all into all, as its `meta` has them.
 """
 
 from tsplat.distributed.collectives import check_group as check_group

@@ -1,8 +1,8 @@
 """Projection of the own splats into the cameras of all ranks: as pairs of a camera and a splat, of which most do not meet.
 
 This bounds memory. Of each pair there is one byte, for a moment (`ops.may_see`); projected, and recorded for backward, are pairs that may meet,
-and coloured and sent those that do. The stages take all splats in all cameras, so that they are called camera by camera; but rows are picked once
-for all, as the gradient of that has a row for every splat.
+and coloured and sent those that do. `ops.project` takes all splats in all cameras, so that it is called camera by camera; but rows are picked
+once for all, as the gradient of that has a row for every splat.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
     if sh_degree is None:
         view_colors = at(colors, splat) if colors.ndim == 2 else at(colors.flatten(0, 1), pair)
     else:
-        counts = _counts(camera, len(viewmats)).tolist()
-        shaded = zip(*(_split(at(x, splat), counts) for x in (means, colors)), torch.split(camera_centers(viewmats), 1), strict=True)
-        view_colors = torch.cat([shade(mean, center, coeffs, sh_degree, center.new_ones(1, len(mean), dtype=torch.bool)).squeeze(0)
-                                 for mean, coeffs, center in shaded])
+        origin = means.new_zeros(1, 3)                      # relative to the cameras, one call serves the pairs of all of them: to the same bits
+        relative = at(means, splat) - camera_centers(viewmats).index_select(0, camera)
+        everything = torch.ones_like(splat, dtype=torch.bool)[None]
+        view_colors = shade(relative, origin, at(colors, splat), sh_degree, everything).squeeze(0)
     finite = is_finite(view_colors).nonzero().squeeze(1)
     visible, camera, splat, pair, view_colors = (x.index_select(0, finite) for x in (visible, camera, splat, pair, view_colors))
     radii, means2d, depths, conics, compensations = (x.index_select(0, visible) for x in (radii, means2d, depths, conics, compensations))

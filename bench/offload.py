@@ -71,10 +71,10 @@ class Traffic:
 
         def chosen(*arguments: Any) -> Tensor:
             start = clock(self.device)
-            rows = may_see(*arguments)
+            seen = may_see(*arguments)
             self.seconds.append(clock(self.device) - start)
-            self.taken.append(len(rows))
-            return rows
+            self.taken.append(int(seen.sum()))
+            return seen
 
         def taken(*arguments: Any) -> Tensor:
             result = take(*arguments)

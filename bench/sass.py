@@ -72,7 +72,7 @@ def compile_only(target: GPUTarget) -> Iterator[list[Any]]:
 
 def launch_everything(quick: bool) -> Iterator[tuple[str, Any]]:
     """Each launch, with the name of its variant; `quick` gives one or two variants of each kernel."""
-    from tsplat.kernels import adam, binning, blending, harmonics, projection, spheres
+    from tsplat.kernels import adam, binning, blending, frustum, harmonics, projection, spheres
 
     C, N, W, H = 2, 1000, 640, 480
 
@@ -90,6 +90,8 @@ def launch_everything(quick: bool) -> Iterator[tuple[str, Any]]:
                 t(N, 3), *shape, t(N), *cameras, W, H, model, 0.01, 1e10, 0.3, True)
             yield label, lambda shape=shape, model=model: projection.project_backward(
                 t(N, 3), *shape, *cameras, W, H, model, 0.3, True, radii, t(C, N, 2), t(C, N), t(C, N, 3), t(C, N))
+        planes = t(C, 2 if model == "fisheye" else 6, 6)
+        yield model, lambda p=planes: frustum.may_see(t(N, 3), t(N), t(N), p)
     for degree in (3,) if quick else range(5):
         mask = t(C, N, dtype=torch.bool)
         coeffs = t(N, (degree + 1) ** 2, 3)

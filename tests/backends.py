@@ -47,7 +47,8 @@ class Backend:
 
 
 OPS: list[Op] = [getattr(importlib.import_module(f"tsplat.ops.{module}"), f"{name}_op") for module, name in (
-    ("projection", "project"), ("projection", "project_backward"), ("harmonics", "harmonics"), ("harmonics", "harmonics_backward"),
+    ("projection", "project"), ("projection", "project_backward"), ("frustum", "may_see"),
+    ("harmonics", "harmonics"), ("harmonics", "harmonics_backward"),
     ("binning", "bin_splats"), ("binning", "bin_splats_fixed"), ("blending", "blend"), ("blending", "blend_backward"),
     ("spheres", "outlines"), ("spheres", "nearest_hits"), ("spheres", "blend_spheres"), ("spheres", "blend_spheres_backward"))]
 KERNELS = Backend("cuda", torch.device("cuda"), torch.float64) if torch.cuda.is_available() else Backend(

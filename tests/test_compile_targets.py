@@ -31,5 +31,6 @@ def test_no_kernel_spills(target: str, tmp_path: Path) -> None:
             "sphere_features_bwd_kernel", "nearest_kernel"} <= names
     assert any("project" in n for n in names)
     assert "adam_rows_kernel" in names
+    assert "may_see_kernel" in names
     assert any("harmonics" in n for n in names)
     assert {(k["kernel"], k["label"]): k["spills"] for k in kernels if k["spills"] != 0} == {}

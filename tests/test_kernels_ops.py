@@ -115,6 +115,8 @@ def test_opcheck_of_every_op() -> None:
             values_and_gradients(render, leaves)
             render(*leaves, capacity=200)
             values_and_gradients(render_spheres, sphere_inputs())
+            means, _, scales, opacities, _, viewmats, Ks, _ = leaves
+            tsplat.ops.may_see(means, scales.amax(1), opacities, viewmats, Ks, WIDTH, HEIGHT, "pinhole", 0.01, 1e10, 0.3)
         assert set(calls) == {op.custom._qualname for op in OPS}
         for op in OPS:
             opcheck(op.custom, calls[op.custom._qualname], test_utils=("test_schema", "test_faketensor"))

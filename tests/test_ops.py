@@ -30,14 +30,19 @@ from tsplat import Camera, ops
 WITHOUT_INTERPRETER = True           # ten minutes there: test_kernels_ops.py takes a selection
 WIDTH, HEIGHT, TILE = 7, 6, 4 if not torch.cuda.is_available() else 8
 # the package has functions of these names
-projection, harmonics, binning, blending, spheres = (importlib.import_module(f"tsplat.ops.{name}") for name in (
-    "projection", "harmonics", "binning", "blending", "spheres"))
+projection, frustum, harmonics, binning, blending, spheres = (importlib.import_module(f"tsplat.ops.{name}") for name in (
+    "projection", "frustum", "harmonics", "binning", "blending", "spheres"))
 
 
 def project_arguments(antialiased: bool = True, covars: bool = False, n: int = 6) -> tuple[Any, ...]:
     s, cam = scenes.splats(n, seed=1), scenes.camera(2, WIDTH, HEIGHT)
     shape = (None, None, reference.covariances(s.quats, s.scales)) if covars else (s.quats, s.scales, None)
     return (s.means, *shape, s.opacities, cam.viewmats, cam.Ks, WIDTH, HEIGHT, "pinhole", 0.01, 1e10, 0.3, antialiased)
+
+
+def may_see_arguments(n: int = 6) -> tuple[Any, ...]:
+    s, cam = scenes.splats(n, seed=1), scenes.camera(2, WIDTH, HEIGHT)
+    return s.means, s.scales.amax(1), s.opacities, cam.viewmats, cam.Ks, WIDTH, HEIGHT, "pinhole", 0.01, 1e10, 0.3
 
 
 def harmonics_arguments(degree: int = 2, n: int = 6) -> tuple[Any, ...]:
@@ -126,6 +131,8 @@ CASES: dict[str, tuple[Any, Callable[..., tuple[Any, ...]], dict[str, Any]]] = {
     "project_backward, N = 0": (projection.project_backward_op, project_backward_arguments, {"n": 0}),
     "project_backward, fixed cameras": (projection.project_backward_op, project_backward_arguments, {"cameras": False}),
     "project_backward, sparse": (projection.project_backward_op, project_backward_arguments, {"sparse": True}),
+    "may_see": (frustum.may_see_op, may_see_arguments, {}),
+    "may_see, N = 0": (frustum.may_see_op, may_see_arguments, {"n": 0}),
     "harmonics": (harmonics.harmonics_op, harmonics_arguments, {}),
     "harmonics, degree 0": (harmonics.harmonics_op, harmonics_arguments, {"degree": 0}),
     "harmonics, N = 0": (harmonics.harmonics_op, harmonics_arguments, {"n": 0}),
@@ -159,6 +166,7 @@ CASES: dict[str, tuple[Any, Callable[..., tuple[Any, ...]], dict[str, Any]]] = {
     "blend_spheres_backward, N = 0": (spheres.blend_spheres_backward_op, sphere_backward_arguments, {"n": 0}),
 }
 FORWARD = [name for name in CASES if "backward" not in name]
+NO_GRADIENT = ("bin", "may_see", "outlines", "nearest")
 
 
 def case(name: str, backend: Backend) -> tuple[Any, list[Any]]:
@@ -264,7 +272,7 @@ def differentiable_case(name: str, backend: Backend) -> tuple[Callable[..., Any]
     return call, inputs
 
 
-WITH_GRADIENT = [name for name in FORWARD if not name.startswith(("bin", "outlines", "nearest"))]
+WITH_GRADIENT = [name for name in FORWARD if not name.startswith(NO_GRADIENT)]
 DIFFERENTIABLE = [name for name in WITH_GRADIENT if "N = 0" not in name]
 
 
@@ -390,7 +398,7 @@ def test_fixed_cameras_change_no_other_gradient(backend: Backend) -> None:
 EVERY_OP = list({id(op): op for op, _, _ in CASES.values()}.values())
 
 
-@pytest.mark.parametrize("name", [name for name in CASES if not name.startswith(("bin", "outlines", "nearest"))])
+@pytest.mark.parametrize("name", [name for name in CASES if not name.startswith(NO_GRADIENT)])
 def test_both_forms_agree(backend: Backend, name: str) -> None:
     """In results, gradients and, from the forward ops, second derivatives."""
     op, args = case(name, backend)
@@ -566,7 +574,7 @@ def test_ops_compute_in_float32_under_autocast(backend: Backend, name: str) -> N
     with torch.autocast(backend.device.type, torch.bfloat16):
         got = op(*half)
     got, want = ([x] if isinstance(x, Tensor) else x for x in (got, op(*full)))
-    assert torch.float32 in {x.dtype for x in got} or name.startswith(("bin_splats", "nearest_hits"))
+    assert torch.float32 in {x.dtype for x in got} or name.startswith(("bin_splats", "may_see", "nearest_hits"))
     assert_same_bits(got, want)
 
 

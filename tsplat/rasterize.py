@@ -12,6 +12,7 @@ from tsplat_reference.constants import ALPHA_MAX, EPS2D
 from tsplat import ops
 from tsplat.camera import MODELS, Camera
 from tsplat.checks import check_choice, check_number, check_size, check_tensor
+from tsplat.drawn import Drawn, is_finite, shade
 
 if TYPE_CHECKING:
     from torch.distributed import ProcessGroup  # some builds of torch have none
@@ -19,21 +20,23 @@ if TYPE_CHECKING:
 TILE = 8
 """Pixels along the side of a tile. On a CPU 8 beats 4, 6 and 16: smaller tiles have more hits to sort, larger ones more idle pairs."""
 MAX_DEGREE = 4
-LEAST = 2.0**-126
-"""The smallest normal number in float32."""
 
 DepthMode = Literal["accumulated", "expected"]
 
 
 class Meta(NamedTuple):
-    """What happened on the way, for C cameras and N Gaussians. Of a call with a `group`: the own Gaussians in the cameras of all ranks, those
-    of rank 0 first, but `offsets` and `hits` of the own cameras.
+    """What happened on the way, for C cameras and N Gaussians.
+
+    Of a call with a `group`, C are the cameras of all W ranks, those of rank 0 first, and N the own Gaussians; but `offsets` and `hits` are of
+    the own cameras. Then `radii`, `means2d` and `depths` have a row for each pair that was drawn, `[V, ...]`, in the order of `visible_ids`, as
+    there are too many of the others to hold.
 
     radii: int32 `[C, N, 2]`, half size in pixels of the box that a splat can touch; 0 if it is culled.
     means2d: `[C, N, 2]` in pixels; part of the graph (`meta.means2d.retain_grad()`).
     depths: `[C, N]`, camera z.
     offsets: int64 `[C tiles_y tiles_x + 1]`, where each tile's list of splats begins. tiles: (tiles_y, tiles_x).
     needed: int64 `[]`, the capacity that was needed, if one was given: if it is more than that, splats are missing in the image.
+    pairs: int64 `[V, 2]`, of a call with a group: camera and Gaussian of each row. shape: then (C, N).
     """
 
     radii: Tensor
@@ -42,6 +45,8 @@ class Meta(NamedTuple):
     offsets: Tensor
     tiles: tuple[int, int]
     needed: Tensor | None = None
+    pairs: Tensor | None = None
+    shape: tuple[int, int] = (0, 0)
 
     @property
     def hits(self) -> Tensor:
@@ -51,12 +56,22 @@ class Meta(NamedTuple):
     @property
     def visible(self) -> Tensor:
         """Bool `[C, N]`: which splats were drawn."""
-        return (self.radii > 0).all(-1)
+        if self.pairs is None:
+            return (self.radii > 0).all(-1)
+        where = self.pairs[:, 0] * self.shape[1] + self.pairs[:, 1]
+        return self.pairs.new_zeros(self.shape, dtype=torch.bool).flatten().index_fill_(0, where, True).view(self.shape)
 
     @property
     def visible_ids(self) -> Tensor:
-        """Int64 `[V, 2]`: camera and Gaussian of the splats that were drawn."""
-        return self.visible.nonzero()
+        """Int64 `[V, 2]`: camera and Gaussian of the splats that were drawn, camera by camera."""
+        return self.visible.nonzero() if self.pairs is None else self.pairs
+
+    @property
+    def views(self) -> Tensor:
+        """Int64 `[N]`: how many of the cameras drew each splat."""
+        if self.pairs is None:
+            return self.visible.sum(0)
+        return self.pairs.new_zeros(self.shape[1]).index_add_(0, self.pairs[:, 1], torch.ones_like(self.pairs[:, 1]))
 
 
 class Rendering(NamedTuple):
@@ -144,26 +159,24 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
                 "channels of colors": colors.shape[-1], "absgrad (1: given)": absgrad is not None}
         inputs = means, quats, scales, covars, opacities, colors, screen_offset, absgrad
         viewmats, Ks = distributed.gather_cameras(viewmats, Ks, group, same, inputs)
-    views = C * ranks                                   # cameras of which this rank projects its splats
-    radii, means2d, depths, conics, compensations = ops.project(
-        means, quats, scales, covars, opacities, viewmats, Ks, width, height, camera.model, camera.near, camera.far, eps2d, antialiased)
-    if screen_offset is not None:
-        means2d = means2d + screen_offset
-    # not expand for one camera: its gradient is a sum, a kernel
-    view_opacities = opacities * compensations if antialiased else opacities[None] if views == 1 else opacities.expand(views, -1)
-
-    if sh_degree is not None:
-        visible = radii[..., 0] > 0                     # both are 0 of a splat that is culled
-        # max(SH + 0.5, 0), with the gradient of 1 at 0 that lets a black splat become lighter: that of clamp_min is three kernels, this one
-        view_colors = torch.nn.functional.threshold(ops.harmonics(means, camera_centers(viewmats), colors, sh_degree, visible) + 0.5, -LEAST, 0.0)
-    else:
-        view_colors = colors if colors.ndim == 3 else colors[None]
-    # 2 kernels where isfinite().all(-1) has 5; of all norms torch is fast on a CPU for this one only (17 times). Beyond 1e19 it is infinite
-    radii = radii * (torch.linalg.vector_norm(view_colors.detach(), 2, -1, keepdim=True) < torch.inf)
-
-    drawn = radii, means2d, conics, view_opacities, view_colors, depths, absgrad
+    settings = width, height, camera.model, camera.near, camera.far, eps2d, antialiased
+    pairs = None
     if group is not None:
-        drawn = distributed.exchange(distributed.Drawn(*drawn), group)
+        own, pairs, counts = distributed.project(means, quats, scales, covars, opacities, colors, viewmats, Ks, settings, sh_degree, screen_offset,
+                                                 absgrad)
+        radii, means2d, depths, drawn = own.radii, own.means2d, own.depths, distributed.send(own, counts, group)
+    else:
+        radii, means2d, depths, conics, compensations = ops.project(means, quats, scales, covars, opacities, viewmats, Ks, *settings)
+        if sh_degree is not None:                       # both radii are 0 of a splat that is culled
+            view_colors = shade(means, camera_centers(viewmats), colors, sh_degree, radii[..., 0] > 0)
+        else:
+            view_colors = colors if colors.ndim == 3 else colors[None]
+        radii = radii * is_finite(view_colors)[..., None]
+        if screen_offset is not None:
+            means2d = means2d + screen_offset
+        # not expand for one camera: its gradient is a sum, a kernel
+        view_opacities = opacities * compensations if antialiased else opacities[None] if C == 1 else opacities.expand(C, -1)
+        drawn = Drawn(radii, means2d, conics, view_opacities, view_colors, depths, absgrad)
     mask, centers, conics, view_opacities, view_colors, zs, absgrad = drawn
     backgrounds = None if background is None else background.expand(C, -1)
     if depth is not None:
@@ -178,7 +191,7 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
         image, z = image[..., :-1], image[..., -1]
         z = z / alpha.clamp_min(1e-10) if depth == "expected" else z
     tiles_x, tiles_y = tile_counts(width, height, tile)
-    meta = Meta(radii, means2d, depths, bins.offsets, (tiles_y, tiles_x), needed)
+    meta = Meta(radii, means2d, depths, bins.offsets, (tiles_y, tiles_x), needed, pairs, (C * ranks, len(means)))
     if camera.batched:
         return Rendering(image, alpha, z, meta)
     # not image[0], of which the gradient is a zeroed and a copied image

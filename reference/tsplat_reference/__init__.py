@@ -8,6 +8,8 @@ from tsplat_reference.blending import blend as blend
 from tsplat_reference.blocks import blend_blocks as blend_blocks
 from tsplat_reference.blocks import blend_blocks_backward as blend_blocks_backward
 from tsplat_reference.camera import camera_centers as camera_centers
+from tsplat_reference.frustum import frustum_planes as frustum_planes
+from tsplat_reference.frustum import may_see as may_see
 from tsplat_reference.harmonics import harmonics as harmonics
 from tsplat_reference.harmonics import harmonics_backward as harmonics_backward
 from tsplat_reference.projection import Projection as Projection

@@ -27,6 +27,9 @@ FLATTEST = 1e-30
 FRUSTUM_MARGIN = 0.3
 """x/z and y/z in the pinhole Jacobian are clamped to the frustum widened by this part of its half size."""
 
+VIEW_SLACK = 1e-4
+"""Relative slack of sizes and opacities in the test of what a camera may see."""
+
 COMPENSATION_MIN = 0.005
 """Floor of the antialiasing compensation sqrt(det(before blur) / det(after)) (gsplat main and Inria; gsplat 1.5.3: 0)."""
 

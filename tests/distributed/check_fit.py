@@ -290,6 +290,7 @@ def check_what_several_ranks_cannot(ranks: Ranks) -> None:
     capture = capture_of(ranks)
     run: Callable[..., Any] = lambda **changes: fit(capture, config_of(**changes), progress=False, group=ranks.group)      # noqa: E731
     expect(NotImplementedError, "primitive: expected 'gaussians' with more than one process", lambda: run(primitive="spheres"))
+    expect(NotImplementedError, "offload: expected False with more than one process", lambda: run(offload=True))
     expect(NotImplementedError, "video: expected 0 with more than one process; got 3", lambda: run(video=3))
     capture.width[2] = 31
     expect(ValueError, "data: expected photos of one size with more than one process; got 2 sizes: 31x24, 32x24", run)

@@ -58,6 +58,23 @@ def check_what_travels(ranks: Ranks) -> None:
     assert widths[1:] == [10, 10], widths                       # the first: what the ranks compare
 
 
+def check_what_is_recorded(ranks: Ranks) -> None:
+    """For backward, of splats of which each camera sees 1 in 40: nothing of a row per splat, let alone one for each camera and splat."""
+    arguments, camera = scenes.splats(800)._asdict() | {"colors": scenes.sh_coefficients(800, 3)}, scenes.camera(2)
+    arguments["means"][:, 0] += 50.0 * (torch.arange(800) % 40)
+    inputs, shapes = leaves(*arguments.values()), []
+
+    def noted(tensor: Tensor) -> Tensor:
+        shapes.append(tensor.shape)
+        return tensor
+
+    with torch.autograd.graph.saved_tensors_hooks(noted, lambda tensor: tensor):
+        rendering = rasterize(**dict(zip(arguments, inputs, strict=True)), camera=camera, sh_degree=3, group=ranks.group)
+    assert 0 < len(rendering.meta.visible_ids) <= 20 * 2 * ranks.count
+    assert max(max(shape, default=0) for shape in shapes) < 800, shapes
+    rendering.image.sum().backward()                            # as all ranks do
+
+
 def check_equal_depths(ranks: Ranks) -> None:
     """The order is that of the ranks, then that of the splats."""
     n = 12
@@ -101,7 +118,7 @@ def check_gradients_of_the_means_on_screen(ranks: Ranks) -> None:
     rendering, _ = render(arguments, camera, shards.options | {"group": ranks.group, "screen_offset": offset})
     rendering.meta.means2d.retain_grad()
     rendering.image.square().sum().backward()
-    assert torch.equal(rendering.meta.means2d.grad, offset.grad)
+    assert torch.equal(rendering.meta.means2d.grad, offset.grad[rendering.meta.visible])
     assert (offset.grad[rendering.meta.visible] != 0).any()
     assert (offset.grad[~rendering.meta.visible] == 0).all()
 

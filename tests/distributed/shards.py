@@ -76,10 +76,11 @@ def compare(ranks: Ranks, shards: Shards) -> None:
     v_part = torch.autograd.grad(weighted(got, [w[cameras] for w in weights]), inputs, materialize_grads=True)
 
     assert_close(got, [x[cameras] for x in outputs(whole)], 1e-14)
+    visible = whole.meta.visible[:, splats]
     for name in ("means2d", "depths"):
-        assert_close(getattr(part.meta, name), getattr(whole.meta, name)[:, splats], 1e-14)
-    assert_same_bits([part.meta.radii, part.meta.hits, part.meta.visible_ids],
-                     [whole.meta.radii[:, splats], whole.meta.hits[cameras], whole.meta.visible[:, splats].nonzero()])
+        assert_close(getattr(part.meta, name), getattr(whole.meta, name)[:, splats][visible], 1e-14)
+    assert_same_bits([part.meta.radii, part.meta.hits, part.meta.visible_ids, part.meta.visible, part.meta.views],
+                     [whole.meta.radii[:, splats][visible], whole.meta.hits[cameras], visible.nonzero(), visible, visible.sum(0)])
     names = [*shards.shared, *shards.views, *shards.own, "viewmats", "Ks"]
     for name, wanted, found in zip(names, v_whole, v_part, strict=True):
         kind = "shared" if name in shards.shared else "views" if name in shards.views else "own"

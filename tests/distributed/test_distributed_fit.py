@@ -130,6 +130,9 @@ def test_wrong_command_lines_under_torchrun(capture: Path, tmp_path: Path, monke
                           (["--device", "meta"], "--device: expected cpu or cuda")):
         assert main(arguments(capture, tmp_path, *options)) == 2
         assert f"tsplat: error: {text}" in capsys.readouterr().err
+    for command in (["view", "scene.ply"], ["info", "scene.ply"], ["render", "scene.ply", "-o", "turn.gif"]):
+        assert main(command) == 2
+        assert f"tsplat: error: tsplat {command[0]}: expected one process; got 2 of torchrun" in capsys.readouterr().err
 
 
 def test_what_torchrun_says(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -133,3 +133,6 @@ def test_regularisers_are_their_formulas() -> None:
     assert float(value(scale=0.1) or 0) == pytest.approx(0.1 * 24 / 9)
     assert float(value(opacity_depth=0.1) or 0) == pytest.approx(-0.1 * (1 + 6) / 2 / 2)      # over the visible
     assert float(value(opacity=1.0, scale=1.0) or 0) == pytest.approx(1.7 / 3 + 24 / 9)
+    pairs = torch.tensor([[0, 0], [0, 1]])                                                     # as several ranks have them: the drawn alone
+    meta = meta._replace(radii=radii[0, :2], depths=depths[0, :2], pairs=pairs, shape=(1, 3))
+    assert float(value(opacity_depth=0.1) or 0) == pytest.approx(-0.1 * (1 + 6) / 2 / 2)

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 import torch
 
 import tsplat
-from tsplat.cli import compare, convert, eval, fit, info, render, view
+from tsplat.cli import compare, convert, eval, fit, info, render, torchrun, view
 from tsplat.cli.parser import Parser
 
 INTERRUPTED = 130                    # the exit status of a shell's command that was stopped by Ctrl-C
@@ -67,6 +67,9 @@ def _run(options: argparse.Namespace) -> int:
     try:
         with warnings.catch_warnings():
             warnings.showwarning = lambda message, *_: print(f"tsplat: warning: {message}", file=sys.stderr)
+            if options.command != "fit" and torchrun.ranks() > 1:
+                raise ValueError(f"tsplat {options.command}: expected one process; got {torchrun.ranks()} of torchrun, among which only "
+                                 "`tsplat fit` shares its work")
             options.run(options)
     except KeyboardInterrupt as interrupt:
         print(f"tsplat: {str(interrupt) or 'interrupted'}", file=sys.stderr)
@@ -95,7 +98,7 @@ def _parser() -> argparse.ArgumentParser:
                                         epilog=f"examples:\n{command.EXAMPLES.strip(chr(10))}")
         command.add_arguments(subparser)
         subparser.add_argument("--debug", action="store_true", help="show where an error came from (also: TSPLAT_DEBUG=1)")
-        subparser.set_defaults(run=command.run)
+        subparser.set_defaults(run=command.run, command=name)
     return parser
 
 

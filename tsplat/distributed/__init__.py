@@ -5,7 +5,8 @@ Training"). A call does, on every rank:
 
 1. compare what has to be equal on all ranks, so that a mistake is an error everywhere rather than a process that waits for ever, and
    gather the cameras (25 numbers each);
-2. project the own splats into the cameras of all ranks, and evaluate their colours there (SH coefficients never travel);
+2. choose the own splats that each camera of all ranks may see, project these into it, and evaluate the colours of those that it does see (SH
+   coefficients never travel);
 3. tell each rank how many splats it will get (one int64 per camera), and send the visible ones, 7 + D numbers each for D channels;
 4. bin and blend what came, for the own cameras.
 
@@ -31,8 +32,9 @@ process, which decides between equal depths, so that images are those of one pro
   belongs to the rank's own cameras needs nothing.
 - Regularisers of splats are sums over the own splats, divided by the number of splats of *all* ranks where they are means, and not by
   the number of ranks.
-- Density control works on each rank alone: `meta.radii`, `meta.means2d`, `screen_offset` and `absgrad` are `[ranks C, N]`, the own splats
-  in all cameras, those of rank 0 first. With the loss above, screen-space gradients are those of a batch: the number of all cameras times
+- Density control works on each rank alone: `screen_offset` and `absgrad` are `[ranks C, N]`, the own splats in all cameras, those of rank 0
+  first; `meta.radii`, `meta.means2d` and `meta.depths` are rows of the pairs that were drawn, whose cameras and splats are `meta.visible_ids`, and
+  `meta.views` counts cameras by splat. With the loss above, screen-space gradients are those of a batch: the number of all cameras times
   smaller than of a loss of one image, for which thresholds are made. Ranks grow differently; when their numbers differ much, move splats (a
   plain `all_to_all_single` of rows) between steps. The objects of `tsplat.fit.density` know of ranks (`tsplat.fit.ranks.Ranks`) and do all this
   but the moving, and `tsplat.fit.fit(..., group=group)` is a whole training loop.
@@ -40,12 +42,13 @@ process, which decides between equal depths, so that images are those of one pro
 All ranks make the same calls in the same order. What only one rank can see (a tensor of a wrong shape) raises on that rank only; `torchrun`
 then ends the others. Under torch.compile, what differs between ranks raises without saying what.
 
-Memory: per own splat and camera of *all* ranks, seen or not, projection holds 44 bytes in float32 (80 with SH coefficients), and backward
-another 40: 4.8 GB per rank for 40M splats in all and one camera per rank, whatever the number of ranks (`bench/distributed.py`).
+Memory: per own splat and camera of *all* ranks one byte, for a moment, and 8 for the gradient of `screen_offset` or `absgrad` where these are given;
+what is projected, and held for backward, is what a camera may see, about 1000 bytes each with the drawing (`bench/distributed.py`, which measures it
+and says what 40M and 1B splats take). Fisheye cameras may see all in front of them: of these pairs, 100 bytes each are held. The drop-in for gsplat
+projects all into all, as its `meta` has them.
 """
 
 from tsplat.distributed.collectives import check_group as check_group
-from tsplat.distributed.exchange import Drawn as Drawn
-from tsplat.distributed.exchange import exchange as exchange
 from tsplat.distributed.exchange import send as send
 from tsplat.distributed.gathering import gather_cameras as gather_cameras
+from tsplat.distributed.projection import project as project

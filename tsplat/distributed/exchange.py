@@ -2,42 +2,12 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import torch
 from torch import Tensor
 from torch.distributed import ProcessGroup
 
 from tsplat.distributed.collectives import all_to_all
-
-
-class Drawn(NamedTuple):
-    """What binning and blending take of N splats in C cameras.
-
-    radii: int32 `[C, N, 2]`, 0 for splats that are not drawn. means2d: `[C, N, 2]`. conics: `[C, N, 3]`. opacities: `[C, N]`.
-    colors: `[C, N, D]`. depths: `[C, N]`. absgrad: `[C, N, 2]` or None. Opacities and colors may have 1 for C, if all cameras share them.
-    """
-
-    radii: Tensor
-    means2d: Tensor
-    conics: Tensor
-    opacities: Tensor
-    colors: Tensor
-    depths: Tensor
-    absgrad: Tensor | None
-
-
-def exchange(own: Drawn, group: ProcessGroup) -> Drawn:
-    """From own splats in the cameras of all ranks, `[W C, N, ...]`, to visible splats of all ranks in the own cameras, `[C, M, ...]`."""
-    visible = (own.radii > 0).all(-1)                                                       # [W C, N]
-    index = visible.flatten().nonzero().squeeze(1)                                          # [V], camera by camera
-
-    def rows(values: Tensor) -> Tensor:
-        flat = values.flatten(0, 1)                                                         # [W C N, ...], or [N, ...] if cameras share them
-        return flat.index_select(0, index % len(flat))                                      # its gradient is an index_add; that of [] sorts
-
-    return send(Drawn(own.radii, rows(own.means2d), rows(own.conics), rows(own.opacities[..., None])[:, 0], rows(own.colors),
-                      rows(own.depths[..., None])[:, 0], None if own.absgrad is None else rows(own.absgrad)), visible.sum(1), group)
+from tsplat.drawn import Drawn
 
 
 def send(rows: Drawn, counts: Tensor, group: ProcessGroup) -> Drawn:

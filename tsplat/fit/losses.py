@@ -73,13 +73,21 @@ def depth_loss(depth: Tensor, alpha: Tensor, truth: Tensor) -> Tensor:
 
 
 class Seen(Protocol):
-    """What is known of a rendering: which splats were visible, bool `[C, N]`, and their camera z, `[C, N]`."""
+    """What is known of a rendering: which splats were visible, bool `[C, N]`, and their camera z, `[C, N]`; or where there are `pairs`, int64
+    `[V, 2]` of a camera and a splat that it saw, `[V]`, and (C, N).
+    """
 
     @property
     def visible(self) -> Tensor: ...
 
     @property
     def depths(self) -> Tensor: ...
+
+    @property
+    def pairs(self) -> Tensor | None: ...
+
+    @property
+    def shape(self) -> tuple[int, int]: ...
 
 
 def scene_regulariser(opacities: Tensor, scales: Tensor, meta: Seen, extent: float, *, opacity: float, scale: float,
@@ -100,9 +108,13 @@ def scene_regulariser(opacities: Tensor, scales: Tensor, meta: Seen, extent: flo
         n = max(1, ranks.total(len(opacities)))
         terms = [weight * values.sum() / (n * values.shape[1:].numel()) for weight, values in ((opacity, opacities), (scale, scales)) if weight]
     if opacity_depth:
-        visible = meta.visible
-        seen = (opacities * meta.depths).where(visible, 0.0).sum(1) / ranks.add(visible.sum(1)).clamp(min=1)                   # [C]
-        terms.append(-opacity_depth * seen.mean() / extent)
+        if meta.pairs is None:
+            total, count = (opacities * meta.depths).where(meta.visible, 0.0).sum(1), meta.visible.sum(1)                      # [C]
+        else:
+            camera, splat = meta.pairs.unbind(1)
+            total = opacities.new_zeros(meta.shape[0]).index_add(0, camera, opacities.index_select(0, splat) * meta.depths)
+            count = torch.bincount(camera, minlength=meta.shape[0])
+        terms.append(-opacity_depth * (total / ranks.add(count).clamp(min=1)).mean() / extent)
     return sum(terms[1:], terms[0]) if terms else None
 
 

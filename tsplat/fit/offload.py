@@ -4,6 +4,14 @@ All that a fit knows of splats is then in host memory, with as many rows as the 
 state, what density control sums up. Rows are put together in pinned memory, from where a GPU fetches them by itself. On a CPU the result
 has the same bits as without: the splats left out are ones that would not be drawn, the others keep their order, and what is computed of
 all (opacities, scales, regularisers) is computed of all here, too.
+
+**What is pinned** is what moves: the rows that a camera may see, put together by the CPU in a buffer of page-locked memory that torch keeps for
+the next step. The scene itself and the optimiser's state are not. A GPU copies what lies in one piece, and chosen rows do not: they would have to be
+put together all the same, and to lock 944 bytes per splat takes them from everything else on the machine, and seconds when they grow.
+
+**Nothing is fetched ahead.** What the next camera may see, and the values of it, can change until Adam, here on the CPU, has moved all rows; so
+nothing is known that could be copied beside a step, on another stream, but the photo, which is (`PhotoStream`). It would gain little: for 23,390
+of 1M splats 5.4 MiB go down and 5.9 up, half a millisecond at 25 GB/s, of a step of 500 on the CPU (`bench/offload.py`).
 """
 
 from __future__ import annotations
@@ -14,9 +22,10 @@ from typing import Any
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
+from tsplat_reference.constants import EPS2D
 
 from tsplat.camera import Camera
-from tsplat.fit.frustum import may_see
+from tsplat.ops import may_see
 from tsplat.ops.common import spread
 from tsplat.rasterize import Rendering
 from tsplat.scene import Gaussians
@@ -33,7 +42,10 @@ def draw_rows(draw: Callable[..., Rendering], gaussians: Gaussians, camera: Came
         What `draw` gave, with a `meta` of all N splats in host memory, but for the lists of the tiles: those left out are culled.
     """
     with torch.no_grad():
-        rows = may_see(gaussians.means, gaussians.log_scales.amax(1).exp(), gaussians.opacities, camera.to(gaussians.device))
+        near = camera.to(gaussians.device)
+        seen = may_see(gaussians.means, gaussians.log_scales.amax(1).exp(), gaussians.opacities, near.viewmats[None], near.Ks[None],
+                       camera.width, camera.height, camera.model, camera.near, camera.far, EPS2D)
+        rows = seen[0].nonzero()[:, 0]
     device, n = camera.viewmats.device, len(gaussians)
     rendering = draw(_Rows(gaussians, rows, device), probes={name: take(probe, rows, 1, device) for name, probe in probes.items()})
     meta = rendering.meta

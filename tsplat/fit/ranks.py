@@ -76,8 +76,8 @@ class Ranks:
     def gather(self, values: Tensor) -> tuple[Tensor, slice]:
         """`[N, ...]` of the splats of all ranks, and which of them are those of this rank, from `[n, ...]` of its own.
 
-        For scores, which decide between all splats: 8 bytes for each on every rank, and 16 more where they are sorted, for a moment; projection
-        holds 44 for each and each camera.
+        For scores, which decide between all splats: 8 bytes for each on every rank, and 16 more where they are sorted, for a moment, as a step
+        has 8 for each and each camera where density control looks on.
         """
         if self.group is None:
             return values, slice(0, len(values))

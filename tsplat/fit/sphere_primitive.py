@@ -38,6 +38,13 @@ class SphereMeta(NamedTuple):
 
     visible: Tensor
     depths: Tensor
+    pairs: None = None
+    shape: tuple[int, int] = (0, 0)
+
+    @property
+    def views(self) -> Tensor:
+        """Int64 `[N]`: how many of the cameras saw each sphere."""
+        return self.visible.sum(0)
 
 
 class SphereDrawing(NamedTuple):

@@ -213,7 +213,7 @@ def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStr
     for parameter in state.photos.parameters():
         if parameter.grad is not None:
             parameter.grad = ranks.add(parameter.grad)
-    seen = rendering.meta.visible.any(0)
+    seen = rendering.meta.views > 0
     state.drawn = max(state.drawn, int(seen.sum()))
     added = state.control.growth(scene, number)
     with ranks.agreement():

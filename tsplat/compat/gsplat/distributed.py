@@ -8,7 +8,8 @@ import torch
 from torch import Tensor
 from torch.distributed import ProcessGroup
 
-from tsplat.distributed import Drawn, check_group, gather_cameras, send
+from tsplat.distributed import check_group, gather_cameras, send
+from tsplat.drawn import Drawn
 
 
 def gather(viewmats: Tensor, Ks: Tensor, inputs: Sequence[Tensor | None], same: Mapping[str, float]

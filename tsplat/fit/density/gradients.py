@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+
 import torch
 from torch import Tensor, nn
 
@@ -26,7 +28,7 @@ class ScreenGradients:
     def probes(self, scene: nn.Module, cameras: int) -> dict[str, Tensor]:
         """The argument for `rasterize`."""
         means = scene.get_parameter("means")
-        self._probe = means.new_zeros(cameras, len(means), 2, requires_grad=True)
+        self._probe = means.new_zeros(()).expand(cameras, len(means), 2).requires_grad_()       # zeros that take no memory; its gradient does
         return {"absgrad" if self.absolute else "screen_offset": self._probe}
 
     def observe(self, meta: Meta, camera: Camera) -> None:
@@ -35,7 +37,8 @@ class ScreenGradients:
         if probe is None or probe.grad is None:
             return
         half = probe.new_tensor([camera.width / 2, camera.height / 2]) * self.batch
-        norms, visible = (probe.grad * half).norm(dim=-1).sum(0), meta.visible.sum(0).to(probe)
+        norms = functools.reduce(torch.add, ((gradient * half).norm(dim=-1) for gradient in probe.grad))         # camera by camera, for memory
+        visible = meta.views.to(probe)
         if self.total is None or self.views is None or len(self.total) != len(norms):
             self.total, self.views = norms, visible
         else:

@@ -168,7 +168,7 @@ def test_adaptive_never_exceeds_its_cap_and_takes_the_largest_gradients() -> Non
 
 
 def test_adaptive_prunes_the_huge_after_a_reset() -> None:
-    for step, left in ((20, 1), (31, 0)):
+    for step, left in ((20, 1), (30, 1), (33, 1), (34, 1), (35, 0)):          # at 34 it has settled, and what step 35 draws is judged
         scene = scene_of(1)
         with torch.no_grad():
             scene.log_scales.fill_(0.0)
@@ -188,6 +188,43 @@ def test_reset_of_opacities() -> None:
     assert torch.equal(adam.state[scene.means]["exp_avg"], 10 * scene.means.detach())
     assert [step for step in range(100) if not control.settled(step)] == [30, 31, 32, 33, 34, 60, 61, 62, 63, 64, 90, 91, 92, 93, 94]
     assert control.settled(1020)                                       # no reset after the schedule
+
+
+def test_nothing_is_judged_right_after_a_reset() -> None:
+    """What is due then is left out, and gradients of what was drawn then do not count: splats that faded stay, and those that are pulled at."""
+    scene = scene_of(3)
+    adam, control = marked(scene), AdaptiveControl(1e6, ALWAYS, reset_every=10, settle=3)
+    sizes = []
+    for step in range(9, 16):
+        with torch.no_grad():
+            scene.opacity_logits.fill_(0.0)
+            scene.opacity_logits[0] = -6                               # to be pruned
+        if control.probes(scene, step):
+            see(control, scene, torch.full((len(scene),), 3e-4))       # to be cloned, if it is seen
+        n, allowed = len(scene), control.growth(scene, step)
+        control.update(scene, adam, step, seeded(step))
+        assert len(scene) <= n + allowed
+        assert (scene.opacities.max() < 0.02) == (step == 10)
+        sizes.append(len(scene) - n)
+    assert [size != 0 for size in sizes] == [True, True, False, False, False, True, True]      # 11, 12 and 13 draw what 10, 11 and 12 left
+
+
+@given(stop=st.integers(1, 400), every=st.integers(2, 90), part=st.floats(0, 1), batch=st.integers(1, 8))
+def test_what_is_reset_settles_before_the_schedule_ends(stop: int, every: int, part: float, batch: int) -> None:
+    control = AdaptiveControl(1.0, Schedule(1, stop, 10, batch), reset_every=every, settle=int(part * (every - 1)))
+    assert all(control.settled(step) for step in range(stop, stop + 100))
+    unsettled = [step for step in range(stop) if not control.settled(step)]
+    assert all(step % every < control.settle and step >= every for step in unsettled)
+    assert len(unsettled) == max(0, (stop - control.settle) // every) * control.settle
+
+
+def test_a_scene_that_would_never_settle() -> None:
+    with pytest.raises(ValueError, match=r"^reset_every: expected 0, or more than settle = 30 steps, which are at least 0; got 30$"):
+        AdaptiveControl(1.0, ALWAYS, reset_every=30, settle=30)
+    with pytest.raises(ValueError, match=r"^reset_every: expected 0, or more than settle = 1 steps"):
+        AdaptiveControl(1.0, ALWAYS, reset_every=1)
+    assert AdaptiveControl(1.0, ALWAYS, reset_every=0).settled(1)
+    assert AdaptiveControl(1.0, ALWAYS).settle == 499
 
 
 def test_absgrad_asks_the_renderer_for_it() -> None:
@@ -305,7 +342,7 @@ def test_mcmc_noise_is_of_the_splats_shape_and_for_the_faint() -> None:
     torch.testing.assert_close(deviation, torch.ones(3), atol=0.05, rtol=0)      # standard error 1.1 %
 
 
-@pytest.mark.parametrize("control", [NoControl(), AdaptiveControl(1.0, ALWAYS, reset_every=1), Budget(1.0, ALWAYS, 10), MCMC(ALWAYS, 10)])
+@pytest.mark.parametrize("control", [NoControl(), AdaptiveControl(1.0, ALWAYS, reset_every=2), Budget(1.0, ALWAYS, 10), MCMC(ALWAYS, 10)])
 def test_no_splats(control: Control) -> None:
     scene = scene_of(0)
     adam = marked(scene)
@@ -382,6 +419,8 @@ def test_schedule(config: Make, steps: int) -> None:
     assert all(steps / 60 - 1 <= step < steps / 2 for step in due)
     if steps == 30_000:
         assert due == list(range(500, 15_000, 100))
+        assert density_schedule(config(steps=steps, density="mcmc")) == Schedule(500, 25_000, 100)      # as published
+        assert density_schedule(config(steps=steps, density="mcmc", density_stop=0.5)) == schedule
     if steps >= 100:
         assert len(due) >= 9
         assert [schedule.part(step) for step in due] == pytest.approx([(i + 1) / len(due) for i in range(len(due))])

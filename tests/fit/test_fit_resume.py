@@ -1,5 +1,6 @@
 """Checkpoints: a fit that was killed goes on as if it had not been, and nothing is lost or written over."""
 
+import itertools
 import os
 import resource
 import signal
@@ -7,6 +8,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,6 +18,7 @@ from compare import saved_state
 import tsplat.fit.trainer
 from tsplat.fit import FitConfig, Step, fit
 from tsplat.fit.photos import PhotoParameters
+from tsplat.fit.primitive import primitive_of
 from tsplat.scene import Capture
 
 Make = Callable[..., FitConfig]
@@ -124,12 +127,12 @@ def test_files_of_others_stay(capture: Capture, config: Make, tmp_path: Path) ->
 
 @pytest.mark.parametrize("changes", [
     {"max_splats": 300},
-    {"density": "adaptive", "density_threshold": 1e-5, "reset_every": 9000, "max_splats": 400},
+    {"density": "adaptive", "density_threshold": 1e-5, "reset_every": 10_500, "max_splats": 400},      # the reset is after step 7
     {"density": "mcmc", "max_splats": 250, "optimiser": "visible"},
     {"refine_poses": True, "exposure": True, "resolution_warmup": 0.6, "opacity_depth_reg": 0.01, "background": "random", "pose_steps": 2},
 ])
 def test_everything_resumes_bit_equal(capture: Capture, config: Make, tmp_path: Path, changes: dict[str, Any]) -> None:
-    """Stopped after step 7: amid a round of density control, and between two checkpoints."""
+    """Stopped after step 7: amid a round of density control, between two checkpoints, and right after a reset."""
     def press(step: Step) -> None:
         if step.number == 7:
             os.kill(os.getpid(), signal.SIGINT)
@@ -137,6 +140,7 @@ def test_everything_resumes_bit_equal(capture: Capture, config: Make, tmp_path: 
     c = config(density_start=0.1, density_every=4, **{"density_stop": 0.9, **changes})
     with pytest.raises(KeyboardInterrupt):
         fit(capture, c, tmp_path / "stopped", progress=False, callbacks=[press])
+    assert [path.name for path in (tmp_path / "stopped").iterdir()] == ["checkpoint.pt"]
     resumed = fit(capture, c, tmp_path / "stopped", progress=False)
     straight = fit(capture, c, tmp_path / "whole", progress=False)
     assert (tmp_path / "stopped" / "scene.ply").read_bytes() == (tmp_path / "whole" / "scene.ply").read_bytes()
@@ -144,17 +148,39 @@ def test_everything_resumes_bit_equal(capture: Capture, config: Make, tmp_path: 
     assert saved_state(tmp_path / "stopped") == saved_state(tmp_path / "whole")
 
 
-def test_nothing_is_saved_right_after_a_reset(capture: Capture, config: Make, tmp_path: Path) -> None:
-    """Resets after steps 6 and 12, then 1 step of unrest: the checkpoints due at 6, 7 and 12 are written after steps 5 and 11."""
-    c = config(steps=14, density="adaptive", density_stop=1.0, reset_every=6 * 30_000 // 14, checkpoint_every=1)
-    saved = []
+@pytest.mark.parametrize(("interval", "steps"), [(1, [*range(1, 19), 22, 23, 24]), (4, [4, 8, 12, 16, 18, 22])])
+def test_nothing_is_saved_or_scored_right_after_a_reset(capture: Capture, config: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
+                                                        interval: int, steps: list[int]) -> None:
+    """A reset after step 19 of 25, which settles after step 22. What falls due meanwhile is saved before and after: no two are further apart than the
+    interval, if that is at least 4."""
+    c = config(steps=25, density="adaptive", density_stop=1.0, reset_every=19 * 30_000 // 25, checkpoint_every=interval)
+    saved, settled = [], []
+    monkeypatch.setattr(tsplat.fit.trainer, "save_checkpoint", lambda path, state, config, capture: saved.append(state.step))
+    result = fit(capture, c, tmp_path, progress=False, callbacks=[lambda step: settled.append(step.settled)])
+    assert saved == [*steps, 25]
+    assert [number for number, is_settled in enumerate(settled, 1) if not is_settled] == [19, 20, 21]
+    assert settled[-1]
+    assert (result.gaussians.opacities > 0.02).any()                   # 0.01 after the reset
 
-    def look(step: Step) -> None:
-        if (tmp_path / "checkpoint.pt").exists():
-            saved.append(torch.load(tmp_path / "checkpoint.pt", weights_only=True)["state"]["step"])
 
-    fit(capture, c, tmp_path, progress=False, callbacks=[look])
-    assert saved == [1, 2, 3, 4, 5, 5, 7, 8, 9, 10, 11, 11, 13]
+def test_no_reset_that_would_not_settle(capture: Capture, config: Make) -> None:
+    """Of 16 steps one would come after the 15th, which the last would draw."""
+    c = config(steps=16, density="adaptive", density_stop=1.0, reset_every=15 * 30_000 // 16)
+    assert (fit(capture, c, progress=False).gaussians.opacities > 0.1).any()
+
+
+@pytest.mark.parametrize(("photos", "most"), [(1, 500), (4, 504)])
+def test_no_more_is_lost_than_the_interval(photos: int, most: int) -> None:
+    """Of a fit of 30,000 steps with the resets of 3DGS, and the default interval of 500; of several ranks, which count `photos`, a step's more."""
+    config = FitConfig(steps=30_000, density="adaptive")
+    control = primitive_of(config).control(config, 1.0, 100)
+    state, saved = SimpleNamespace(step=0, ranks=SimpleNamespace(count=photos), control=control), [0]
+    for state.step in range(photos, config.steps, photos):
+        if tsplat.fit.trainer._due(state, config, saved[-1]):          # type: ignore[arg-type]
+            assert control.settled(state.step)
+            saved.append(state.step)
+    assert max(b - a for a, b in itertools.pairwise([*saved, config.steps])) == most
+    assert len(saved) < 70
 
 
 def test_parameter_of_a_photo_that_is_not_finite(capture: Capture, config: Make, monkeypatch: pytest.MonkeyPatch) -> None:

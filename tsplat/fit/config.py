@@ -51,7 +51,8 @@ class FitConfig:
         "density control; budget: exactly max_splats in the end, by score; adaptive: clone, split, prune and reset as in 3DGS; "
         "mcmc: relocation and noise; none"))
     density_start: float = field(default=1 / 60, metadata=_about(DENSITY, "part of the steps before density control", 0, 1))
-    density_stop: float = field(default=0.5, metadata=_about(DENSITY, "part of the steps after which it ends", 0, 1))
+    density_stop: float | None = field(default=None, metadata=_about(DENSITY,
+        "part of the steps after which it ends; default 1/2, with mcmc 5/6", 0, 1))
     density_every: int = field(default=100, metadata=_about(DENSITY, "steps between its actions; a twentieth of the steps at most", 1))
     density_absgrad: bool = field(default=False, metadata=_about(DENSITY,
         "adaptive: judge by gradients without regard to sign (budget always does)"))
@@ -103,13 +104,13 @@ class FitConfig:
     offload: bool = field(default=False, metadata=_about(BASICS,
         "keep the scene in host memory; a step takes to the device what its camera may see (Gaussians only; the same result)", decides=False))
     video: int = field(default=0, metadata=_about(OUTPUT, "frames of a turntable, OUT/turntable.gif; 0: none", 0, decides=False))
-    checkpoint_every: int = field(default=500, metadata=_about(OUTPUT, "steps between checkpoints", 1, decides=False))
+    checkpoint_every: int = field(default=500, metadata=_about(OUTPUT, "steps between checkpoints; with resets of the opacities, at least those in which the scene settles", 1, decides=False))
 
     def __post_init__(self) -> None:
         for item in fields(self):
             _check(item.name, str(item.type), getattr(self, item.name), item.metadata["low"], item.metadata["high"])
-        if self.density_start > self.density_stop:
-            raise ValueError(f"density_start: expected at most density_stop = {self.density_stop:g}; got {self.density_start!r}")
+        if self.density_start > (stop := self.value("density_stop")):
+            raise ValueError(f"density_start: expected at most density_stop = {stop:g}; got {self.density_start!r}")
         if self.offload and self.primitive != "gaussians":
             raise NotImplementedError(f"offload: only scenes of Gaussians can stay in host memory yet; got primitive = {self.primitive!r}")
 
@@ -130,6 +131,7 @@ class FitConfig:
 
 
 DEFAULTS = {
+    "density_stop": {"mcmc": 5 / 6, "others": 0.5},
     "init_opacity": {"mcmc": 0.5, "spheres": 0.5, "others": 0.1},
     "init_scale": {"mcmc": 0.1, "others": 1.0},
     "opacity_reg": {"random budget": 0.01, "mcmc": 0.01, "others": 0.0},

@@ -45,7 +45,7 @@ def divisor_at(config: FitConfig, step: int) -> int:
 def density_schedule(config: FitConfig, photos: int = 1) -> Schedule:
     """When density control acts, with so many photos at a time."""
     every = min(config.density_every, max(1, config.steps // MIN_ACTIONS))
-    return Schedule(max(1, round(config.density_start * config.steps)), round(config.density_stop * config.steps), every, photos)
+    return Schedule(max(1, round(config.density_start * config.steps)), round(config.value("density_stop") * config.steps), every, photos)
 
 
 def regulariser_weights(config: FitConfig, step: int, *, random_start: bool) -> dict[str, float]:
@@ -56,5 +56,6 @@ def regulariser_weights(config: FitConfig, step: int, *, random_start: bool) -> 
 
 
 def reset_interval(config: FitConfig) -> int:
-    """Steps between resets of the opacities; 0: none."""
-    return round(config.reset_every * config.steps / REFERENCE_STEPS)
+    """Steps between resets of the opacities; 0: none, as where they would come at every step."""
+    interval = round(config.reset_every * config.steps / REFERENCE_STEPS)
+    return interval if interval > 1 else 0

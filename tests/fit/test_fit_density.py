@@ -371,8 +371,9 @@ def test_in_a_loop_of_ones_own() -> None:
         truth.log_scales.fill_(-2.0)
         target = rasterize(truth.means, truth.quats, truth.scales, truth.opacities, truth.sh0[:, 0], camera).image
     errors = {}
-    for control in (NoControl(), Budget(1.0, Schedule(10, 60, 10), 60), AdaptiveControl(1.0, Schedule(10, 60, 10), reset_every=0)):
-        start = scene_of(10, seed=6)
+    for control in (NoControl(), Budget(1.0, Schedule(10, 60, 10), 60), AdaptiveControl(1.0, Schedule(10, 60, 10), reset_every=0),
+                    MCMC(Schedule(10, 60, 2), 60, noise=8 / 0.03)):            # noise times rate: a tenth of the published, for so few steps
+        start = scene_of(20, seed=6)
         names = ("means", "quats", "log_scales", "opacity_logits", "sh0")
         scene = nn.ParameterDict({name: start.get_parameter(name).detach().clone() for name in names})
         adam = Adam([{"params": [p], "name": name} for name, p in scene.items()], lr=0.03)
@@ -389,6 +390,7 @@ def test_in_a_loop_of_ones_own() -> None:
     assert len(scene["means"]) > 10
     assert errors["Budget"] < 0.8 * errors["NoControl"]
     assert errors["AdaptiveControl"] < 0.8 * errors["NoControl"]
+    assert errors["MCMC"] < 0.9 * errors["NoControl"]                  # from 20 splats to 50, 5 % at a time
 
 
 @pytest.mark.parametrize(("kind", "changes"), [

@@ -17,7 +17,7 @@ from tsplat.camera import Camera
 from tsplat.fit.checkpoint import restore, save_checkpoint
 from tsplat.fit.config import FitConfig
 from tsplat.fit.drawing import step_background
-from tsplat.fit.evaluation import Quality, evaluate, mean_quality, picture_name, refined_cameras
+from tsplat.fit.evaluation import Quality, mean_quality, picture_name, scores
 from tsplat.fit.interrupt import deferred_interrupt
 from tsplat.fit.losses import Target, depth_loss, photo_loss, psnr, target_of
 from tsplat.fit.memory import check_growth
@@ -96,11 +96,11 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
     to the power of K (`set_rates`). When one rank has more than 1.1 times the mean number of splats, they are made even again. All photos need one
     size, and all ranks the same `out` on one file system.
 
-    **Right after a reset** of the opacities (`AdaptiveControl`) a scene is not itself. It always has settled when the fit ends, so that what is scored
-    and written is settled. Density control does not judge before, nor should callbacks (`Step.settled`), and no checkpoint is written that falls due
-    meanwhile: instead there is one right before the reset, and one as soon as the scene has settled. So a killed fit loses at most
-    `checkpoint_every` steps, or as many as a scene takes to settle, a sixtieth of all, where these are more. (Of several ranks, up to the photos of a
-    step more.) What Ctrl-C and errors leave is the state of that moment, settled or not, from which the fit goes on to the same bits.
+    **Right after a reset** of the opacities (`AdaptiveControl`) a scene is not itself. It always has settled when the fit ends, so that what is
+    scored and written is settled. Density control does not judge before, nor should callbacks (`Step.settled`), and no checkpoint is written that
+    falls due meanwhile: instead there is one right before the reset, and one as soon as the scene has settled. So a killed fit loses at most
+    `checkpoint_every` steps, or as many as a scene takes to settle, a sixtieth of all, where these are more. (Of several ranks, up to the photos of
+    a step more.) What Ctrl-C and errors leave is the state of that moment, settled or not, from which the fit goes on to the same bits.
 
     Args:
         data: a capture, or the folder of one (see `load_capture`; `downscale` and `test_every` of the config apply to a
@@ -147,12 +147,7 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
     if output is not None:
         save_checkpoint(output.checkpoint, state, config, capture)
         output.pictures.mkdir(exist_ok=True)
-    pictures = None if output is None else output.pictures
-    qualities = evaluate(state.gaussians, capture, capture.test, config, pictures, device=state.device, ranks=ranks)
-    refined = {}
-    if config.refine_poses:
-        cameras = refined_cameras(state.gaussians, capture, capture.test, config, state.device, ranks)
-        refined = evaluate(state.gaussians, capture, capture.test, config, cameras=cameras, device=state.device, ranks=ranks)
+    qualities, refined = scores(state.gaussians, capture, config, None if output is None else output.pictures, state.device, ranks)
     scene = state.whole_scene(config)
     if output is not None and ranks.rank == 0:
         output.write(scene, config, qualities, refined, state.seconds)

@@ -4,8 +4,9 @@
 
 Some different JPEG files are drawn (noise of all scales, 1.3 MB each), and a capture in a temporary folder has links to them for photos. They
 are read as the trainer reads them: in random order, the next by the worker thread while one is used, which is to make of it what a step compares
-with. Nothing is rendered. A row for each mark gives the photos so far, the peak of the process's memory, and photos per second. At the first mark the
-cache of decoded photos (`tsplat.scene.images.CACHE_BYTES`) has filled up, and from there on memory should not grow.
+with. Nothing is rendered. A row for each mark gives the photos so far, the peak of the process's memory, and photos per second of wall and of CPU
+time, which other work on the machine changes less. At the first mark the cache of decoded photos (`tsplat.scene.images.CACHE_BYTES`) has filled up,
+and from there on memory should not grow.
 """
 
 from __future__ import annotations
@@ -65,7 +66,7 @@ def make_capture(folder: Path, photos: int, size: tuple[int, int]) -> Path:
 def stream(capture: Capture, marks: list[int]) -> list[dict[str, Any]]:
     """A row for each of the marks, up to the last."""
     order = torch.randperm(len(capture), generator=torch.Generator().manual_seed(0)).tolist()
-    rows, start = [], time.perf_counter()
+    rows, wall, cpu = [], time.perf_counter(), time.process_time()
     with PhotoStream(capture.images) as images:
         for done, view in enumerate(order, 1):
             photo = images[view]
@@ -74,8 +75,9 @@ def stream(capture: Capture, marks: list[int]) -> list[dict[str, Any]]:
             target = target_of(photo, torch.zeros(3), masked=False)
             assert target.image.shape == (capture.height[view], capture.width[view], 3)
             if done in marks:
-                rows.append({"streamed": done, "peak_MiB": peak_mib(), "photos_per_s": done / (time.perf_counter() - start)})
-                print("| {streamed:,} | {peak_MiB:,.0f} | {photos_per_s:.1f} |".format(**rows[-1]), flush=True)
+                rows.append({"streamed": done, "peak_MiB": peak_mib(), "photos_per_s": done / (time.perf_counter() - wall),
+                             "photos_per_cpu_s": done / (time.process_time() - cpu)})
+                print("| {streamed:,} | {peak_MiB:,.0f} | {photos_per_s:.1f} | {photos_per_cpu_s:.1f} |".format(**rows[-1]), flush=True)
     return rows
 
 
@@ -91,7 +93,7 @@ def measure_all(marks: list[int], size: tuple[int, int]) -> dict[str, Any]:
         decoded = 3 * size[0] * size[1] / 2**20
         print(f"{size[0]}x{size[1]}, {decoded:.1f} MiB each when decoded, {decoded * max(marks) / 1024:.1f} GiB in all; "
               f"{CACHE_BYTES / 2**30:g} GiB of them are kept; {peak_mib():.0f} MiB before the first\n")
-        print("| photos | peak MiB | photos/s |\n" + "| --- " * 3 + "|")
+        print("| photos | peak MiB | photos/s | photos/CPU s |\n" + "| --- " * 4 + "|")
         before = peak_mib()
         rows = stream(capture, marks)
     return {**environment("cpu"), "width": size[0], "height": size[1], "cache_MiB": CACHE_BYTES / 2**20, "all_MiB": decoded * max(marks),

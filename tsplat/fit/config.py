@@ -104,7 +104,7 @@ class FitConfig:
     offload: bool = field(default=False, metadata=_about(BASICS,
         "keep the scene in host memory; a step takes to the device what its camera may see (Gaussians only; the same result)", decides=False))
     video: int = field(default=0, metadata=_about(OUTPUT, "frames of a turntable, OUT/turntable.gif; 0: none", 0, decides=False))
-    checkpoint_every: int = field(default=500, metadata=_about(OUTPUT, 
+    checkpoint_every: int = field(default=500, metadata=_about(OUTPUT,
         "steps between checkpoints; right after a reset of the opacities there is none", 1, decides=False))
 
     def __post_init__(self) -> None:

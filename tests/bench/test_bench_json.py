@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -35,13 +36,54 @@ def test_speed() -> None:
 
 def test_quality(tmp_path: Path) -> None:
     capture = write_synthetic_capture(tmp_path, views=8, size=(32, 24))
-    done = subprocess.run([sys.executable, BENCH / "quality" / "fox.py", "--data", capture, "--seeds", "0", "1", "--steps", "2", "--splats", "100",
-                           "--json"], env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
+    done = subprocess.run([sys.executable, BENCH / "quality" / "fox.py", "--data", capture, "--seeds", "0", "1", "--steps", "6", "--splats", "100",
+                           "--curve", "0.5", "--profile", "--json"], env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert report["capture"] == "fox"
     assert [fit["seed"] for fit in report["fits"]] == [0, 1]
-    assert [line.partition(":")[0] for line in done.stderr.splitlines()] == ["fox seed 0", "fox seed 1"]
+    assert [len(fit["curve"]) for fit in report["fits"]] == [1, 1]
+    assert all(fit["splats_per_s"] > 0 for fit in report["fits"])
+    assert re.search(r"^of [\d.]+ ms a step: .*blending, backward \d+ %", report["profile"])
+    assert re.search(r"binning \d+ %", report["profile"])
+    lines = [line for line in done.stderr.splitlines() if "profiler" not in line]                    # torch's own notes
+    assert [line.partition(":")[0] for line in lines] == ["fox seed 0", "fox seed 1", f"  {report['profile'].partition(':')[0]}"]
+
+
+GPU = """
+import sys, torch
+torch.cuda.is_available = lambda: {gpu}
+import gpu, output
+output.environment = gpu.environment = lambda device: dict(device=device)
+def fit(command, **_):
+    value = lambda option: command[command.index(option) + 1]
+    assert value("--device") == "cuda" and value("--downscale") == "1", command
+    name = value("--rasterizer")
+    if command[1].endswith("chair.py"):
+        return gpu.subprocess.CompletedProcess(command, 1, "", "Traceback\\nRuntimeError: no more memory\\n")
+    scores = [(10.0, 20.0), (30.0, 28.0)] if name == "tsplat" else [(20.0, 20.0), (60.0, 30.0)]
+    one = dict(psnr=31.0, ssim=0.9, splats=5, steps=int(value("--steps")), wall_s=90.0, cpu_s=1.0, splats_per_s=2e6, seed=0, curve=scores)
+    report = dict(rasterizer=name, capture="fox", config=dict(), fits=[one], profile="of 3 ms on the GPU a step: blending 50 %")
+    return gpu.subprocess.CompletedProcess(command, 0, gpu.json.dumps(report), "")
+gpu.subprocess.run = fit
+sys.argv = ["gpu", "--json", "--captures", "fox", "chair", "--steps", "7000"]
+sys.exit(gpu.main())
+"""
+
+
+def test_all_fits_on_a_gpu() -> None:
+    """What the one command makes of the scripts' documents, where fits are made up: none can be made here."""
+    environment = {**ENVIRONMENT, "PYTHONPATH": os.pathsep.join([str(BENCH / "quality"), ENVIRONMENT["PYTHONPATH"]])}
+    done = [subprocess.run([sys.executable, "-c", GPU.format(gpu=gpu)], env=environment, capture_output=True, text=True, timeout=120)
+            for gpu in (False, True)]
+    assert (done[0].returncode, done[0].stdout) == (2, "")
+    assert "no GPU" in done[0].stderr
+    assert done[1].returncode == 0, done[1].stderr
+    ours, theirs, *failed = json.loads(done[1].stdout)["runs"]
+    assert ours["to_quality"] == {"psnr": 30.5, "s": 30 + 60 * 2.5 / 3}
+    assert theirs["to_quality"] == {"psnr": 30.5, "s": 60 + 30 * 0.5}
+    assert [run["error"] for run in failed] == ["RuntimeError: no more memory"] * 2
+    assert "| fox | 7,000 | gsplat | 31.00 | 0.9000 | 5 | 90 | 2e+06 | 75 (30.5 dB) |" in done[1].stderr
 
 
 def test_offload_moves_what_the_formula_says() -> None:

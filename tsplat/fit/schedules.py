@@ -49,8 +49,8 @@ def density_schedule(config: FitConfig, photos: int = 1) -> Schedule:
 
 
 def regulariser_weights(config: FitConfig, step: int, *, random_start: bool) -> dict[str, float]:
-    """Of `scene_regulariser`. Those of opacity and scale make splats fade for density control to recycle, and end with it."""
-    acting = config.density == "none" or step < density_schedule(config).stop
+    """Of `scene_regulariser`. Those of opacity and scale make splats fade for density control to recycle, and end with it, or at half the steps."""
+    acting = config.density == "none" or step < min(density_schedule(config).stop, config.steps / 2)
     opacity, scale = (acting * config.value(name, random_start=random_start) for name in ("opacity_reg", "scale_reg"))
     return {"opacity": opacity, "scale": scale, "opacity_depth": config.opacity_depth_reg}
 

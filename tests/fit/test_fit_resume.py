@@ -1,6 +1,5 @@
 """Checkpoints: a fit that was killed goes on as if it had not been, and nothing is lost or written over."""
 
-import itertools
 import os
 import resource
 import signal
@@ -8,7 +7,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,7 +16,6 @@ from compare import saved_state
 import tsplat.fit.trainer
 from tsplat.fit import FitConfig, Step, fit
 from tsplat.fit.photos import PhotoParameters
-from tsplat.fit.primitive import primitive_of
 from tsplat.scene import Capture
 
 Make = Callable[..., FitConfig]
@@ -146,41 +143,6 @@ def test_everything_resumes_bit_equal(capture: Capture, config: Make, tmp_path: 
     assert (tmp_path / "stopped" / "scene.ply").read_bytes() == (tmp_path / "whole" / "scene.ply").read_bytes()
     assert (resumed.qualities, resumed.refined) == (straight.qualities, straight.refined)
     assert saved_state(tmp_path / "stopped") == saved_state(tmp_path / "whole")
-
-
-@pytest.mark.parametrize(("interval", "steps"), [(1, [*range(1, 19), 22, 23, 24]), (4, [4, 8, 12, 16, 18, 22])])
-def test_nothing_is_saved_or_scored_right_after_a_reset(capture: Capture, config: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-                                                        interval: int, steps: list[int]) -> None:
-    """A reset after step 19 of 25, which settles after step 22. What falls due meanwhile is saved before and after: no two are further apart than the
-    interval, if that is at least 4."""
-    c = config(steps=25, density="adaptive", density_stop=1.0, reset_every=19 * 30_000 // 25, checkpoint_every=interval)
-    saved, settled = [], []
-    monkeypatch.setattr(tsplat.fit.trainer, "save_checkpoint", lambda path, state, config, capture: saved.append(state.step))
-    result = fit(capture, c, tmp_path, progress=False, callbacks=[lambda step: settled.append(step.settled)])
-    assert saved == [*steps, 25]
-    assert [number for number, is_settled in enumerate(settled, 1) if not is_settled] == [19, 20, 21]
-    assert settled[-1]
-    assert (result.gaussians.opacities > 0.02).any()                   # 0.01 after the reset
-
-
-def test_no_reset_that_would_not_settle(capture: Capture, config: Make) -> None:
-    """Of 16 steps one would come after the 15th, which the last would draw."""
-    c = config(steps=16, density="adaptive", density_stop=1.0, reset_every=15 * 30_000 // 16)
-    assert (fit(capture, c, progress=False).gaussians.opacities > 0.1).any()
-
-
-@pytest.mark.parametrize(("photos", "most"), [(1, 500), (4, 504)])
-def test_no_more_is_lost_than_the_interval(photos: int, most: int) -> None:
-    """Of a fit of 30,000 steps with the resets of 3DGS, and the default interval of 500; of several ranks, which count `photos`, a step's more."""
-    config = FitConfig(steps=30_000, density="adaptive")
-    control = primitive_of(config).control(config, 1.0, 100)
-    state, saved = SimpleNamespace(step=0, ranks=SimpleNamespace(count=photos), control=control), [0]
-    for state.step in range(photos, config.steps, photos):
-        if tsplat.fit.trainer._due(state, config, saved[-1]):          # type: ignore[arg-type]
-            assert control.settled(state.step)
-            saved.append(state.step)
-    assert max(b - a for a, b in itertools.pairwise([*saved, config.steps])) == most
-    assert len(saved) < 70
 
 
 def test_parameter_of_a_photo_that_is_not_finite(capture: Capture, config: Make, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
 import torch
 
 from tsplat.scene import write_synthetic_capture
@@ -89,6 +90,16 @@ def test_all_fits_on_a_gpu() -> None:
     assert theirs["to_quality"] == {"psnr": 30.5, "s": 60 + 30 * 0.5}
     assert [run["error"] for run in failed] == ["RuntimeError: no more memory"] * 2
     assert "| fox | 7,000 | gsplat | 31.00 | 0.9000 | 5 | 90 | 2e+06 | 75 (30.5 dB) |" in done.stderr
+
+
+def test_streamed_photos(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(BENCH)
+    import photos
+
+    report = photos.measure_all([2, 6], (64, 48))
+    assert [row["streamed"] for row in report["rows"]] == [2, 6]
+    assert report["all_MiB"] == 6 * 64 * 48 * 3 / 2**20
+    assert 0 < report["before_MiB"] <= report["rows"][0]["peak_MiB"] <= report["rows"][1]["peak_MiB"]
 
 
 def test_offload_moves_what_the_formula_says() -> None:

@@ -73,7 +73,21 @@ QUALITY: Columns = {
     "splats": lambda r: f"{mean(fit['splats'] for fit in r['fits']):,.0f}",
     "wall s": lambda r: spread(r["fits"], "wall_s", 0),
     "CPU s": lambda r: spread(r["fits"], "cpu_s", 0),
+    "splats/s": lambda r: f"{mean(fit['splats_per_s'] for fit in r['fits']):,.0f}" if "splats_per_s" in r["fits"][0] else "",
+    "over time": lambda r: ", ".join(f"{psnr:.1f} after {seconds:.0f} s" for seconds, psnr in r["fits"][0]["curve"]),
     "where it goes": lambda r: r.get("profile", ""),
+}
+PEERS: Columns = {
+    **{name: QUALITY[name] for name in ("capture", "options")},
+    "rasteriser": lambda r: r["rasterizer"],
+    "time to quality": lambda r: f"{r['to_quality']['s']:.0f} s to {r['to_quality']['psnr']:.1f} dB",
+    **{name: column for name, column in QUALITY.items() if name not in ("capture", "options", "seeds", "CPU s")},
+}
+PHOTOS: Columns = {
+    "photos": lambda r: f"{r['streamed']:,}",
+    "peak MiB": lambda r: f"{r['peak_MiB']:,.0f}",
+    "photos/s": lambda r: f"{r['photos_per_s']:.1f}",
+    "photos per CPU s": lambda r: f"{r['photos_per_cpu_s']:.1f}",
 }
 DISTRIBUTED: Columns = {
     "processes": lambda r: str(r["ranks"]),
@@ -98,11 +112,14 @@ def sections(report: Row) -> list[tuple[str, Columns, list[Row]]]:
     """Title, columns and rows of what a document has."""
     if "fits" in report:
         return [(f"Quality on held-out photos: {report['capture']}, {report['config'].get('primitive', 'gaussians')}", QUALITY, [report])]
+    if any("fits" in run for run in report.get("runs", [])):
+        return [("Quality on a GPU, by rasteriser", PEERS, [run for run in report["runs"] if "fits" in run])]
     if "runs" in report:                                  # several commits on one machine
         return [part for run in report["runs"] for part in sections(run)]
     rows = [row for row in report.get("rows", []) if "error" not in row]
     kinds = (("gsplat", "Gaussians on a GPU, beside gsplat", GPU), ("rival_ms", "Gaussians on a CPU", CPU), ("part", "Spheres", SPHERES),
-             ("ranks", "Many processes", DISTRIBUTED), ("without", "Scenes in host memory", OFFLOAD))
+             ("ranks", "Many processes", DISTRIBUTED), ("without", "Scenes in host memory", OFFLOAD),
+             ("streamed", f"Streaming photos of {report.get('width')}x{report.get('height')}, {report.get('all_MiB', 0):,.0f} MiB in all", PHOTOS))
     return [(title + (f", commit {report['commit']}" if "commit" in report else ""), columns, rows)
             for key, title, columns in kinds if rows and key in rows[0]]
 

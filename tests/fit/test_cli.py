@@ -93,6 +93,21 @@ def test_config_of_a_fit_makes_it_again_and_eval_measures_it(capture_folder: Pat
     assert "4 held-out photos" in capsys.readouterr().out
 
 
+def test_eval_gives_both_scores_of_a_fit_that_refined_poses(capture_folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """To the last digit, from scene.ply, config.json and the photos; and the plain one alone, if that is asked for."""
+    assert run("fit", capture_folder, "-o", tmp_path, "--refine-poses", "--pose-steps", 9, "--lr-poses", 3e-4, "--ssim-weight", 0.4, *SHORT) == 0
+    first, said = json.loads((tmp_path / "metrics.json").read_text()), capsys.readouterr().out
+    assert first["mean_with_refined_poses"]["psnr"] > first["mean"]["psnr"] + 0.01
+    assert f"1 held-out photos with their poses refined: PSNR {first['mean_with_refined_poses']['psnr']:.2f} dB" in said
+    (tmp_path / "checkpoint.pt").unlink()
+    assert run("eval", tmp_path / "scene.ply", capture_folder, "-o", tmp_path / "again.json") == 0
+    assert set(said.splitlines()[:2]) < set(capsys.readouterr().out.splitlines())
+    wanted = {key: value for key, value in first.items() if key not in ("splats", "seconds", "config")}
+    assert json.loads((tmp_path / "again.json").read_text()) == wanted
+    assert run("eval", tmp_path / "scene.ply", capture_folder, "--no-refine-poses", "--json") == 0
+    assert json.loads(capsys.readouterr().out) == {key: first[key] for key in ("ssim", "mean", "images")}
+
+
 def test_render_camera(scene: Path, capture_folder: Path, tmp_path: Path) -> None:
     picture = tmp_path / "new" / "view.png"
     assert run("render", scene, "--camera", capture_folder, "--index", 3, "-o", picture) == 0

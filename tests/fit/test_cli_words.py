@@ -129,7 +129,7 @@ def test_ctrl_c_in_the_evaluation_names_the_checkpoint(capture_folder: Path, tmp
 
     arguments = ["fit", str(capture_folder), "-o", str(tmp_path), "--steps", "2", "--splats", "200"]
     with monkeypatch.context() as patch:
-        patch.setattr("tsplat.fit.trainer.evaluate", interrupted)
+        patch.setattr("tsplat.fit.trainer.scores", interrupted)
         assert main(arguments) == 130
     assert capsys.readouterr().err == f"tsplat: interrupted; the same command goes on from {tmp_path / 'checkpoint.pt'}\n"
     assert main(arguments) == 0

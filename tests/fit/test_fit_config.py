@@ -44,5 +44,11 @@ def test_regularisers_end_with_density_control(config: dict[str, Any], random_st
         assert regulariser_weights(chosen, step, random_start=random_start) == {"opacity": 0.0, "scale": 0.0, "opacity_depth": 0.5}
 
 
+def test_regularisers_end_at_half_the_steps_where_density_control_goes_on() -> None:
+    chosen = FitConfig(steps=100, density="mcmc")
+    assert chosen.value("density_stop") == 5 / 6
+    assert [regulariser_weights(chosen, step, random_start=False)["opacity"] for step in (0, 49, 50, 99)] == [0.01, 0.01, 0, 0]
+
+
 def test_regularisers_without_density_control_go_on() -> None:
     assert regulariser_weights(FitConfig(steps=10, density="none", opacity_reg=0.1), 9, random_start=False)["opacity"] == 0.1

@@ -4,6 +4,7 @@ import json
 import threading
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,12 +13,14 @@ import torch
 import tsplat.fit.memory
 from tsplat import Camera
 from tsplat.fit import FitConfig, Step, draw, fit
+from tsplat.fit.evaluation import evaluate, mean_quality
 from tsplat.fit.memory import bytes_for, check_growth, free_bytes
 from tsplat.fit.photos import PhotoParameters
 from tsplat.fit.pose import moved, refined
 from tsplat.fit.stream import PhotoStream
+from tsplat.fit.trainer import start, train_step
 from tsplat.rasterize import rasterize
-from tsplat.scene import Capture, Gaussians, load_capture
+from tsplat.scene import Capture, Gaussians, load_capture, write_synthetic_capture
 from tsplat.scene.synthetic import synthetic_cameras, synthetic_scene
 
 Make = Callable[..., FitConfig]
@@ -93,6 +96,28 @@ def test_poses_that_are_off(capture: Capture, config: Make, tmp_path: Path) -> N
     assert metrics["mean"]["psnr"] == result.mean.psnr
     plain = fit(capture, config(steps=2), progress=False)
     assert plain.refined_mean is None
+
+
+def test_training_poses_come_back(tmp_path: Path, config: Make) -> None:
+    """Cameras to train on are off, held-out ones are right: these score better where the others are refined, which come nearer to where they were."""
+    capture = load_capture(write_synthetic_capture(tmp_path, views=12, size=(64, 48)), test_every=4)
+    true, generator = capture.viewmats.clone(), torch.Generator().manual_seed(0)
+    for i in capture.train:
+        capture.viewmats[i] = moved(capture.camera(i), 0.03 * torch.randn(6, generator=generator), 1.0).viewmats
+    scores, errors = [], []
+    for refine in (False, True):
+        c = config(steps=100, splats=1000, max_splats=1000, density="none", refine_poses=refine, lr_poses=1e-3)
+        state = start(capture, c, torch.device("cpu"))
+        for _ in range(c.steps):
+            train_step(state, capture, c)
+        mean = mean_quality(evaluate(state.gaussians, capture, capture.test, c))
+        assert mean is not None
+        scores.append(mean.psnr)
+        with torch.no_grad():
+            cameras = [state.photos.camera(capture.camera(i), i, capture.extent) for i in capture.train]
+        errors.append(sum(float((camera.viewmats - true[i]).norm()) for camera, i in zip(cameras, capture.train, strict=True)))
+    assert errors[1] < 0.7 * errors[0]
+    assert scores[1] > scores[0] + 0.5
 
 
 def test_scene_does_not_change_while_held_out_poses_are_refined(capture: Capture, config: Make, tmp_path: Path) -> None:
@@ -181,6 +206,37 @@ def test_estimate_of_memory() -> None:
     check_growth(scene, 0, 1, scene.device, 10)
     free = free_bytes(torch.device("cpu"))
     assert free is None or free > 0
+
+
+MIB = 2**20
+
+
+@pytest.mark.parametrize(("group", "files", "free"), [
+    ("0::/", {}, 5000),
+    ("0::/", {"memory.max": "max", "memory.current": 100}, 5000),
+    ("0::/", {"memory.max": 1000, "memory.current": 300, "memory.stat": (100, 50)}, 850),
+    ("0::/a/b", {"memory.max": 1000, "memory.current": 300}, 700),                                    # a container that sees its own group alone
+    ("0::/a/b", {"a/b/memory.max": 1000, "a/b/memory.current": 100, "a/memory.max": 900, "a/memory.current": 300}, 600),      # a group in another
+    ("0::/", {"memory.max": 100, "memory.current": 101}, 0),
+    ("0::/", {"memory.max": 9000, "memory.current": 100}, 5000),                                      # the machine has less
+    ("4:cpu,memory:/a", {"memory/a/memory.limit_in_bytes": 1000, "memory/a/memory.usage_in_bytes": 400, "memory/a/memory.stat": (60, 40)}, 700),
+    ("4:memory:/docker/0", {"memory/memory.limit_in_bytes": 1000, "memory/memory.usage_in_bytes": 400}, 600),
+    ("4:memory:/", {"memory/memory.limit_in_bytes": (2**63 - 4096) // MIB, "memory/memory.usage_in_bytes": 400}, 5000),       # as it says "none"
+])
+def test_free_memory_is_that_of_the_container(tmp_path: Path, group: str, files: dict[str, Any], free: int) -> None:
+    """From files as Linux has them; all numbers in MiB, those of `memory.stat` are inactive and active pages of files, which can be had."""
+    version_1 = group.startswith("4")
+    described = {"proc/meminfo": f"MemTotal: {9000 * 1024} kB\nMemAvailable: {5000 * 1024} kB\n", "proc/self/cgroup": f"1:name=systemd:/\n{group}\n"}
+    for name, value in files.items():
+        if name.endswith("stat"):
+            total = "total_" * version_1
+            value = f"inactive_file 1\nanon 7\n{total}inactive_file {value[0] * MIB}\n{total}active_file {value[1] * MIB}"
+        described[f"sys/fs/cgroup/{name}"] = f"{value if isinstance(value, str) else value * MIB}\n"
+    for name, text in described.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(text)
+    assert free_bytes(torch.device("cpu"), tmp_path) == free * MIB
+    assert free_bytes(torch.device("cpu"), tmp_path / "nothing there") is None
 
 
 def test_estimate_of_memory_of_a_scene_that_is_drawn_elsewhere(monkeypatch: pytest.MonkeyPatch) -> None:

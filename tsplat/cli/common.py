@@ -16,6 +16,7 @@ from tsplat.fit.evaluation import mean_quality
 from tsplat.scene.formats import FORMATS
 
 AXES = {sign + axis: tuple(float(f"{sign}1") * (axis == a) for a in "xyz") for sign in ("", "-") for axis in "xyz"}
+REFINED = "held-out photos with their poses refined"
 SCENE = f"a scene file ({', '.join(item.suffix for item in FORMATS)})"
 
 

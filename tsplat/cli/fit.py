@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import torch
 
 from tsplat.cli import torchrun
-from tsplat.cli.common import add_device, add_fields, config_of, device_of, print_mean
+from tsplat.cli.common import REFINED, add_device, add_fields, config_of, device_of, print_mean
 from tsplat.fit import FitConfig, Step, fit
 from tsplat.fit.checkpoint import read_checkpoint
 from tsplat.fit.output import read_config
@@ -120,6 +120,5 @@ def _fit(options: argparse.Namespace, data: Capture | str | Path, config: FitCon
     if torchrun.rank() > 0:
         return
     print_mean(result.qualities)
-    if result.refined_mean is not None:
-        print(f"with their poses refined, too: PSNR {result.refined_mean.psnr:.2f} dB, SSIM {result.refined_mean.ssim:.4f}")
+    print_mean(result.refined, REFINED)
     print(f"{len(result.gaussians)} splats after {config.steps} steps in {result.seconds:.0f} s: {options.out / 'scene.ply'}")

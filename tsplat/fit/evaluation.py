@@ -57,6 +57,17 @@ def evaluate(gaussians: Scene, capture: Capture, views: Sequence[int], config: F
     return {capture.names[view]: everyone[capture.names[view]] for view in views}
 
 
+def scores(scene: Scene, capture: Capture, config: FitConfig, pictures: Path | None = None, device: torch.device | None = None,
+           ranks: Ranks = ALONE) -> tuple[dict[str, Quality], dict[str, Quality]]:
+    """What a fit reports of the held-out photos: `evaluate` with the capture's cameras, and, if the config refines poses, with `refined_cameras`."""
+    device = device or scene.device
+    plain = evaluate(scene, capture, capture.test, config, pictures, device=device, ranks=ranks)
+    if not config.refine_poses:
+        return plain, {}
+    cameras = refined_cameras(scene, capture, capture.test, config, device, ranks)
+    return plain, evaluate(scene, capture, capture.test, config, cameras=cameras, device=device, ranks=ranks)
+
+
 def _share(views: Sequence[int], ranks: Ranks) -> Iterator[tuple[int, bool]]:
     """Of each so many views as there are ranks, that of this rank, and whether it counts: where none is left, it helps the others with the last."""
     for first in range(0, len(views), ranks.count):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Iterator
+from pathlib import Path, PurePosixPath
+from typing import NamedTuple
 
 import torch
 from torch import nn
@@ -47,13 +49,50 @@ def bytes_for(scene: nn.Module, splats: int, *, copies: int = COPIES, rendering:
     return splats * (copies * each + rendering)
 
 
-def free_bytes(device: torch.device) -> int | None:
-    """Bytes that can be had on a device, with what torch holds in reserve; None where that is not known."""
+def free_bytes(device: torch.device, root: Path = Path("/")) -> int | None:
+    """Bytes that can be had on a device, with what torch holds in reserve; None where that is not known.
+
+    In host memory: what the machine has available, or, if that is less, what the limits of the process's control groups (those of a container)
+    leave. `root` is where `proc` and `sys` are.
+    """
     if device.type == "cuda":
         held = torch.cuda.memory_reserved(device) - torch.cuda.memory_allocated(device)
         return torch.cuda.mem_get_info(device)[0] + held
+    available = [int(line.split()[1]) * 1024 for line in _lines(root / "proc" / "meminfo") if line.startswith("MemAvailable:")]
+    return min([*available, *_left_in_groups(root)], default=None)
+
+
+class Groups(NamedTuple):
+    """Where a version of Linux's control groups says what. folder: of the groups. files: names of the limit and of the use. pages: of file
+    pages in `memory.stat`, which are in use and can be had."""
+
+    folder: str
+    files: tuple[str, str]
+    pages: tuple[str, str]
+
+
+GROUPS = {"": Groups("sys/fs/cgroup", ("memory.max", "memory.current"), ("inactive_file", "active_file")),
+          "memory": Groups("sys/fs/cgroup/memory", ("memory.limit_in_bytes", "memory.usage_in_bytes"), ("total_inactive_file", "total_active_file"))}
+"""By how `/proc/self/cgroup` names the controller: version 2 ("": it has one tree for all), version 1."""
+
+
+def _left_in_groups(root: Path) -> Iterator[int]:
+    """What the limit of the process's group, and of each that holds it, leaves. A container may know its group by a path of the machine, of which
+    it sees nothing but the end, as the folder of all groups."""
+    for line in _lines(root / "proc" / "self" / "cgroup"):
+        _, controllers, path = line.split(":", 2)
+        for version in (GROUPS[name] for name in controllers.split(",") if name in GROUPS):
+            group = PurePosixPath(path)
+            for folder in (root / version.folder / place.relative_to("/") for place in (group, *group.parents)):
+                limit, use = ("".join(_lines(folder / name)) for name in version.files)
+                if limit.isdigit() and use.isdigit():                        # not "max", nor a group whose files are elsewhere
+                    stat = dict(pair.split() for pair in _lines(folder / "memory.stat"))
+                    yield max(0, int(limit) - int(use) + sum(int(stat.get(name, 0)) for name in version.pages))
+
+
+def _lines(path: Path) -> list[str]:
+    """Of a file of the kernel; none if it is not there."""
     try:
-        lines = Path("/proc/meminfo").read_text(encoding="ascii").splitlines()
+        return path.read_text(encoding="utf-8").splitlines()
     except OSError:
-        return None
-    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")), None)
+        return []

@@ -97,9 +97,8 @@ class GaussianPrimitive:
         if config.density == "mcmc":
             return MCMC(schedule, most, ranks=ranks)
         if config.density == "adaptive":
-            reset = reset_interval(config)
-            return AdaptiveControl(extent, schedule, threshold=config.density_threshold, absgrad=config.density_absgrad, reset_every=reset,
-                                   settle=reset // 6, max_splats=most, ranks=ranks)
+            return AdaptiveControl(extent, schedule, threshold=config.density_threshold, absgrad=config.density_absgrad,
+                                   reset_every=reset_interval(config), max_splats=most, ranks=ranks)
         return NoControl()
 
 

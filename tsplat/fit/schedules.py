@@ -45,16 +45,17 @@ def divisor_at(config: FitConfig, step: int) -> int:
 def density_schedule(config: FitConfig, photos: int = 1) -> Schedule:
     """When density control acts, with so many photos at a time."""
     every = min(config.density_every, max(1, config.steps // MIN_ACTIONS))
-    return Schedule(max(1, round(config.density_start * config.steps)), round(config.density_stop * config.steps), every, photos)
+    return Schedule(max(1, round(config.density_start * config.steps)), round(config.value("density_stop") * config.steps), every, photos)
 
 
 def regulariser_weights(config: FitConfig, step: int, *, random_start: bool) -> dict[str, float]:
-    """Of `scene_regulariser`. Those of opacity and scale make splats fade for density control to recycle, and end with it."""
-    acting = config.density == "none" or step < density_schedule(config).stop
+    """Of `scene_regulariser`. Those of opacity and scale make splats fade for density control to recycle, and end with it, or at half the steps."""
+    acting = config.density == "none" or step < min(density_schedule(config).stop, config.steps / 2)
     opacity, scale = (acting * config.value(name, random_start=random_start) for name in ("opacity_reg", "scale_reg"))
     return {"opacity": opacity, "scale": scale, "opacity_depth": config.opacity_depth_reg}
 
 
 def reset_interval(config: FitConfig) -> int:
-    """Steps between resets of the opacities; 0: none."""
-    return round(config.reset_every * config.steps / REFERENCE_STEPS)
+    """Steps between resets of the opacities; 0: none, as where they would come at every step."""
+    interval = round(config.reset_every * config.steps / REFERENCE_STEPS)
+    return interval if interval > 1 else 0

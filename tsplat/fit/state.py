@@ -33,7 +33,7 @@ class FitState:
         generator: the source of all that is random (on the CPU, whatever the device).
         device: where a step is computed, and `photos` are; not always where the scene is (`FitConfig.offload`).
         step: photos done.
-        drawn: the most splats that a step drew, since the fit was last started.
+        drawn: the most splats that a step drew, since the fit was last started; counted where the scene is drawn elsewhere than it is.
         queue: photos yet to come before all are shuffled anew, last first.
         seconds: wall time spent so far.
         history: of loss, PSNR and splats.

@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 
 from tsplat.camera import Camera
 from tsplat.fit.checkpoint import restore, save_checkpoint
 from tsplat.fit.config import FitConfig
 from tsplat.fit.drawing import step_background
-from tsplat.fit.evaluation import Quality, evaluate, mean_quality, picture_name, refined_cameras
+from tsplat.fit.evaluation import Quality, mean_quality, picture_name, scores
 from tsplat.fit.interrupt import deferred_interrupt
 from tsplat.fit.losses import Target, depth_loss, photo_loss, psnr, target_of
 from tsplat.fit.memory import check_growth
@@ -47,6 +47,7 @@ class Step:
         photo: its name; that of this rank.
         loss, psnr: of its render before the step (PSNR in dB); means over ranks.
         gaussians: the scene after the step; this rank's splats. A callback may look at it, not change it.
+        settled: whether it can be judged: not so right after a reset of its opacities (`Control.settled`).
     """
 
     number: int
@@ -54,6 +55,7 @@ class Step:
     loss: float
     psnr: float
     gaussians: Scene
+    settled: bool = True
 
 
 @dataclass(frozen=True)
@@ -93,6 +95,12 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
     counting photos, so that the same config is the same fit in K times fewer steps: schedules stay, rates rise by sqrt(K) (`rate_factor`), betas are
     to the power of K (`set_rates`). When one rank has more than 1.1 times the mean number of splats, they are made even again. All photos need one
     size, and all ranks the same `out` on one file system.
+
+    **Right after a reset** of the opacities (`AdaptiveControl`) a scene is not itself. It always has settled when the fit ends, so that what is
+    scored and written is settled. Density control does not judge before, nor should callbacks (`Step.settled`), and no checkpoint is written that
+    falls due meanwhile: instead there is one right before the reset, and one as soon as the scene has settled. So a killed fit loses at most
+    `checkpoint_every` steps, or as many as a scene takes to settle, a sixtieth of all, where these are more. (Of several ranks, up to the photos of
+    a step more.) What Ctrl-C and errors leave is the state of that moment, settled or not, from which the fit goes on to the same bits.
 
     Args:
         data: a capture, or the folder of one (see `load_capture`; `downscale` and `test_every` of the config apply to a
@@ -139,12 +147,7 @@ def fit(data: Capture | str | os.PathLike[str], config: FitConfig | None = None,
     if output is not None:
         save_checkpoint(output.checkpoint, state, config, capture)
         output.pictures.mkdir(exist_ok=True)
-    pictures = None if output is None else output.pictures
-    qualities = evaluate(state.gaussians, capture, capture.test, config, pictures, device=state.device, ranks=ranks)
-    refined = {}
-    if config.refine_poses:
-        cameras = refined_cameras(state.gaussians, capture, capture.test, config, state.device, ranks)
-        refined = evaluate(state.gaussians, capture, capture.test, config, cameras=cameras, device=state.device, ranks=ranks)
+    qualities, refined = scores(state.gaussians, capture, config, None if output is None else output.pictures, state.device, ranks)
     scene = state.whole_scene(config)
     if output is not None and ranks.rank == 0:
         output.write(scene, config, qualities, refined, state.seconds)
@@ -214,10 +217,12 @@ def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStr
         if parameter.grad is not None:
             parameter.grad = ranks.add(parameter.grad)
     seen = rendering.meta.views > 0
-    state.drawn = max(state.drawn, int(seen.sum()))
+    if config.offload:                                    # else the number would be of no use, and worth no wait for the device
+        state.drawn = max(state.drawn, int(seen.sum()))
     added = state.control.growth(scene, number)
+    quality = psnr(rendering.image.detach(), target)
     with ranks.agreement():
-        _check_finite(float(loss.detach()), [scene, state.photos], f"step {number}, photo {capture.names[view]}")
+        mine = _finite(loss, quality, [scene, state.photos], f"step {number}, photo {capture.names[view]}")
         check_growth(scene, added, number, device, state.drawn)
     state.control.observe(rendering.meta, camera)
     set_rates(state.adam, primitive.rates(config, extent, state.step, ranks.count), ranks.count)
@@ -225,15 +230,15 @@ def _step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStr
     primitive.confine(scene)
     state.photos.step(views, config, state.step)
     state.step = number
-    losses, qualities = zip(*ranks.numbers(float(loss.detach()), float(psnr(rendering.image.detach(), target))), strict=True)
+    losses, qualities = zip(*ranks.numbers(*mine), strict=True)
     state.control.update(scene, state.adam, state.step, ranks.local(state.generator))
-    return Step(state.step, capture.names[view], sum(losses), sum(qualities) / ranks.count, scene)
+    return Step(state.step, capture.names[view], sum(losses), sum(qualities) / ranks.count, scene, state.control.settled(state.step))
 
 
 def _train(state: FitState, capture: Capture, config: FitConfig, output: Output | None, progress: bool,
            callbacks: Sequence[Callable[[Step], None]]) -> None:
     """All steps that are left."""
-    before, begin, kept = state.seconds, time.perf_counter(), state.step > 0      # kept: whether there is a checkpoint of this fit
+    before, begin, kept = state.seconds, time.perf_counter(), state.step          # kept: the step of the last checkpoint; 0: there is none
     with (deferred_interrupt() as interrupt, progress_line(config.steps, state.step, shown=progress) as show,
           PhotoStream(capture.images) as images):
         while state.step < config.steps:
@@ -252,21 +257,21 @@ def _train(state: FitState, capture: Capture, config: FitConfig, output: Output 
             if moves(sizes):
                 state.rebalance(sizes, capture, config)
             state.seconds = before + time.perf_counter() - begin
-            if output is not None and (_due(state, config) or stop):
+            if output is not None and (stop or _due(state, config, kept)):
                 save_checkpoint(output.checkpoint, state, config, capture)
-                kept = True
+                kept = state.step
             if stop:
                 raise KeyboardInterrupt(f"stopped after step {state.step} of {config.steps}" + (
                     "" if output is None else f"; the same call goes on from {output.checkpoint}"))
 
 
-def _due(state: FitState, config: FitConfig) -> bool:
-    """Whether to write a checkpoint now: where one is due right after a reset of opacities, it is written before that instead."""
+def _due(state: FitState, config: FitConfig, kept: int) -> bool:
+    """Whether to write a checkpoint now: if the next settled scene, or the end, will be more than the interval after the last one, `kept`."""
     step, photos = state.step, state.ranks.count
-    if not state.control.settled(step):
+    if step >= config.steps or not state.control.settled(step):
         return False
     following = next((s for s in range(step + photos, config.steps, photos) if state.control.settled(s)), config.steps)
-    return step < config.steps and any(s % config.checkpoint_every == 0 for s in range(step, following))
+    return following - kept > config.checkpoint_every
 
 
 def _check_ranks(capture: Capture, config: FitConfig, ranks: Ranks) -> None:
@@ -294,10 +299,17 @@ def _reduced(camera: Camera, target: Target, divisor: int) -> tuple[Camera, Targ
     return camera.resized(width, height), target.resized(width, height)
 
 
-def _check_finite(loss: float, modules: Sequence[nn.Module], where: str) -> None:
-    if not math.isfinite(loss):
-        raise FloatingPointError(f"{where}: the loss is {loss}; expected a finite number. The scene is as before this step")
-    for module in modules:
-        for name, parameter in module.named_parameters():
-            if parameter.grad is not None and not bool(parameter.grad.sum().isfinite()):
-                raise FloatingPointError(f"{where}: the gradient of {name} is not finite. The scene is as before this step")
+def _finite(loss: Tensor, quality: Tensor, modules: Sequence[nn.Module], where: str) -> tuple[float, float]:
+    """Loss and quality as numbers, where the loss and all gradients are finite.
+
+    All that is to be known comes from the device at once: each number alone would be a wait for it (up to 10 in a step).
+    """
+    gradients = {name: parameter.grad.sum() for module in modules for name, parameter in module.named_parameters() if parameter.grad is not None}
+    scalars = [loss.detach(), quality, *gradients.values()]
+    numbers: list[float] = torch.stack([scalar.to(loss.device) for scalar in scalars]).tolist()
+    if not math.isfinite(numbers[0]):
+        raise FloatingPointError(f"{where}: the loss is {numbers[0]}; expected a finite number. The scene is as before this step")
+    for name, total in zip(gradients, numbers[2:], strict=True):
+        if not math.isfinite(total):
+            raise FloatingPointError(f"{where}: the gradient of {name} is not finite. The scene is as before this step")
+    return numbers[0], numbers[1]

@@ -11,6 +11,7 @@ with any of them:
         control.observe(rendering.meta, camera)
         optimiser.step()
         control.update(scene, optimiser, step, generator)
+        if control.settled(step): ...                    # else it would not be fair to score or save the scene: its opacities were just reset
 """
 
 from tsplat.fit.density.adaptive import AdaptiveControl

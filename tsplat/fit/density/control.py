@@ -62,7 +62,7 @@ class Control(Protocol):
         ...
 
     def settled(self, step: int) -> bool:
-        """Whether the scene can be judged after `step` steps: not right after its opacities were reset."""
+        """Whether the scene can be judged after `step` steps: not right after its opacities were reset. It can at the end of a fit."""
         ...
 
     def state_dict(self) -> dict[str, Any]:

@@ -1,4 +1,5 @@
-"""`bench/gpu.py` and `bench/spheres.py --device cuda` from end to end without a GPU: what asks a GPU for times is replaced, and the peer is the drop-in."""
+"""What is to run on a GPU at the first call: `bench/gpu.py` with stand-ins for what asks a GPU for times, and the drop-in for the peer, and
+`bench/spheres.py` on a CPU, both with small scenes."""
 
 import json
 import os
@@ -39,6 +40,13 @@ if "gsplat" in sys.argv:
     sys.modules["gsplat"] = tsplat.compat.gsplat
 sys.exit(gpu.main())
 """
+SPHERES = """
+import spheres
+spheres.TABLE = [spheres.Setup("Table 2", 15_099, 0.06, 24, 24), spheres.Setup("Table 2", 40, 0.2, 24, 24, 0.0)]
+spheres.FIGURE = [spheres.of_figure(50, 24, 24)]
+if __name__ == "__main__":
+    spheres.main()
+"""
 
 
 def run(script: str, *arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -74,8 +82,20 @@ def test_gpu_in_parts(tmp_path: Path) -> None:
     assert "no such file" in done.stdout or "not found" in done.stdout
 
 
+def test_spheres(tmp_path: Path) -> None:
+    done = run(SPHERES, "--device", "cpu", "--no-figure", "--times", "2", "--threads", "1", "--out", tmp_path, "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert [row["spheres"] for row in report["rows"]] == [15_099, 40, 50]
+    for row in report["rows"]:
+        assert 0 < row["forward"]["wall"] < row["both"]["wall"]
+    assert [json.loads(path.read_text()) for path in tmp_path.glob("*-spheres-cpu.json")] == [report]
+    table, = (path.read_text() for path in tmp_path.glob("*-spheres-cpu.md"))
+    assert "| forward 1300: met, backward 2600: met |" in table
+
+
 @pytest.mark.parametrize("script", ["gpu.py", "sweep.py"])
 def test_without_a_gpu(script: str) -> None:
-    done = subprocess.run([sys.executable, BENCH / script], env={**ENVIRONMENT, "CUDA_VISIBLE_DEVICES": ""}, capture_output=True, text=True, timeout=60)
+    done = subprocess.run([sys.executable, BENCH / script], env={**ENVIRONMENT, "CUDA_VISIBLE_DEVICES": ""}, capture_output=True, text=True)
     assert done.returncode == 2
     assert "no GPU" in done.stderr

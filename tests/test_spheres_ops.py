@@ -94,8 +94,8 @@ def test_threads_change_no_bit() -> None:
 
 
 @pytest.mark.parametrize("dynamic", [False, True])
-def test_compiles_without_graph_breaks(dynamic: bool) -> None:
-    s, camera = scenes.spheres(12), scenes.camera(2, 9, 7)
+def test_compiles_without_graph_breaks(backend: Backend, dynamic: bool) -> None:
+    s, camera = backend.put(scenes.spheres(12)), backend.put(scenes.camera(2, 9, 7))
 
     def step(p: Tensor, f: Tensor, R: Tensor, o: Tensor, g: Tensor, viewmats: Tensor, Ks: Tensor) -> tuple[Tensor, ...]:
         r = tsplat.render_spheres(p, f, R, dataclasses.replace(camera, viewmats=viewmats, Ks=Ks), opacities=o, gamma=g, depth="expected",
@@ -106,7 +106,7 @@ def test_compiles_without_graph_breaks(dynamic: bool) -> None:
 
     compiled = torch.compile(step, fullgraph=True, dynamic=dynamic, backend="aot_eager")
     for n in (12, 7):
-        inputs = (*(x[:n] for x in s), torch.tensor(0.1, dtype=torch.float64), camera.viewmats, camera.Ks)
+        inputs = (*(x[:n] for x in s), backend.put(torch.tensor(0.1)), camera.viewmats, camera.Ks)
         mine, others = leaves(*inputs), leaves(*inputs)
         want, got = step(*mine), compiled(*others)
         assert_close(got, want, 1e-14)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
+import math
 from collections.abc import Callable, Iterator
 
 import pytest
@@ -150,6 +152,21 @@ def test_bins_are_those_of_the_reference(name: str, memory: Callable[[Tensor, st
     assert torch.equal(ids[:len(want.ids)].cpu(), want.ids)
     assert torch.equal(offsets.cpu(), want.offsets)
     assert int(needed) == len(want.ids)
+
+
+@pytest.mark.parametrize("memory", [guarded, in_gaps])
+def test_lists_in_float32_go_front_to_back_and_equals_by_index(memory: Callable[[Tensor, str], Tensor]) -> None:
+    """The bits of a float are its key then: of either sign, and zeros of either sign, too."""
+    s = scenes.splats2d(2, 30, 20, 12, size=(2.0, 9.0))
+    depths = torch.randint(-3, 4, (2, 30), generator=scenes.generator(5)).float() * 1.5e3
+    depths[:, ::7] *= 0.0
+    arguments = s.means2d.float(), s.radii, s.conics.float(), s.opacities.float(), depths
+    ids, offsets = (x.cpu() for x in binning.bin_splats(*(memory(x, DEVICE) for x in arguments), 20, 12, TILE))
+    flat = depths.flatten().tolist()
+    assert {math.copysign(1.0, d) for d in flat if d == 0} == {1.0, -1.0}
+    lists = [ids[a:b].tolist() for a, b in itertools.pairwise(offsets.tolist())]
+    assert min(map(len, lists)) > 5
+    assert lists == [sorted(some, key=lambda i: (flat[i], i)) for some in lists]
 
 
 def test_tiles_beyond_32_bits() -> None:

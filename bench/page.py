@@ -43,9 +43,9 @@ GPU: Columns = {
     "forward ms": lambda r: f"{r['ms']['forward'][0]:.2f}",
     "fwd+bwd ms": lambda r: f"{r['ms']['both'][0]:.2f}",
     "MiB": lambda r: f"{r['peak_MiB']:.0f}",
-    "gsplat's forward": lambda r: f"{r['gsplat']['forward'][0]:.2f}",
-    "fwd+bwd": lambda r: f"{r['gsplat']['both'][0]:.2f}",
-    "times as fast": lambda r: f"{r['gsplat']['both'][0] / r['ms']['both'][0]:.2f}",
+    "gsplat's forward": lambda r: f"{r['gsplat']['forward'][0]:.2f}" if "forward" in r["gsplat"] else "none",
+    "fwd+bwd": lambda r: f"{r['gsplat']['both'][0]:.2f}" if "both" in r["gsplat"] else "none",
+    "times as fast": lambda r: f"{r['gsplat']['both'][0] / r['ms']['both'][0]:.2f}" if "both" in r["gsplat"] else "",
 }
 CPU: Columns = {
     "size": lambda r: f"{r['width']}x{r['height']}",
@@ -135,7 +135,7 @@ def page(folder: Path) -> str:
     for path in sorted(folder.glob("*.json"), reverse=True):
         report = json.loads(path.read_text(encoding="utf-8"))
         for title, columns, rows in sections(report):
-            versions = [f"{key} {report[key]}" for key in ("torch", "triton", "gsplat", "threads") if key in report]
+            versions = [f"{key} {report[key]}" for key in ("torch", "triton", "gsplat", "threads") if report.get(key)]
             lines += [f"## {title}", "", f"{report.get('machine') or report['device']}, {report['date']}, {', '.join(versions)}"
                       + (f": `{report['command']}`" if "command" in report else "") + f" ([{path.name}]({path.name}))", "", *table(columns, rows), ""]
     lines += ["## In words", "", "What else was measured, and what was tried: " + ", ".join(

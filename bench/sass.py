@@ -15,7 +15,7 @@ import os
 import re
 import subprocess
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -108,6 +108,8 @@ def launch_everything(quick: bool) -> Iterator[tuple[str, Any]]:
         yield label, lambda c=colors, D=D: blending.blend(*splats, c, t(C, D), ids, offsets, W, H, 8, 0.99, False)
         yield label, lambda c=colors, D=D, i=images, a=absgrad: blending.blend_backward(
             *splats, c, t(C, D), ids, offsets, *i, *i, W, H, 8, 0.99, False, a)
+    rgb = t(1, N, 3), t(C, 3), ids, offsets, *((t(C, H, W, 3), t(C, H, W)) * 2)
+    yield "3 channels, deterministic", deterministic(lambda: blending.blend_backward(*splats, *rgb, W, H, 8, 0.99, False, False))
     geometry, tiles = (t(C, N, 3), t(1, N), t(C, 3, 3)), t(C * 80 * 60, dtype=torch.int32)
     plain, full = ("pinhole", False, False), ("pinhole", True, True)
     variants = [(3, *plain), (32, *plain)] if quick else [(D, *plain) for D in (1, 3, 4, 32, 128)] + [(3, "orthographic", False, False),
@@ -119,10 +121,24 @@ def launch_everything(quick: bool) -> Iterator[tuple[str, Any]]:
         yield label, lambda i=inputs, o=options, e=everything: spheres.blend_spheres(*i, *o, e, 1e-4)
         yield label, lambda i=inputs, o=options, e=everything, m=images: spheres.blend_spheres_backward(
             *i, m[1] if e else None, m, m[0], m[1] if e else None, m[2], *o, e)
+        if label == "3 channels":
+            yield f"{label}, deterministic", deterministic(lambda i=inputs, o=options, m=images: spheres.blend_spheres_backward(
+                *i, None, m, m[0], None, m[2], *o, False))
     for model in ("pinhole",) if quick else ("pinhole", "orthographic"):
         yield model, lambda m=model: spheres.outlines(*geometry, W, H, m, 0.1, 9.0)
         for count in (5,) if quick else (1, 5, 6):
             yield f"{model}, {count}", lambda n=count, m=model: spheres.nearest_hits(*geometry, ids, offsets, n, W, H, 8, m, 0.1, 9.0, False)
+
+
+def deterministic(launch: Callable[[], object]) -> Callable[[], None]:
+    """The launch under `torch.use_deterministic_algorithms(True)`."""
+    def launched() -> None:
+        torch.use_deterministic_algorithms(True)
+        try:
+            launch()
+        finally:
+            torch.use_deterministic_algorithms(False)
+    return launched
 
 
 class Usage(NamedTuple):

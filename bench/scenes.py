@@ -20,7 +20,7 @@ import tsplat
 
 
 class Scene(NamedTuple):
-    """Inputs of `tsplat.rasterize` (float32)."""
+    """Inputs of `tsplat.rasterize` (float32). With sh_degree, colors are SH coefficients."""
 
     means: Tensor
     quats: Tensor
@@ -29,6 +29,11 @@ class Scene(NamedTuple):
     colors: Tensor
     background: Tensor
     camera: tsplat.Camera
+    sh_degree: int | None = None
+
+    def to(self, device: str) -> Scene:
+        """The same on another device."""
+        return Scene(*(x.to(device) for x in self[:6]), self.camera.to(device), self.sh_degree)
 
 
 def random_scene(n: int, width: int, height: int, seed: int = 0, area: tuple[float, float] = (50.0, 400.0)) -> Scene:

@@ -14,8 +14,8 @@ import sys
 from typing import Any
 
 import torch
-from gpu import SIZES, milliseconds, stage_calls, to
-from scenes import random_scene
+from gpu import milliseconds, stage_calls
+from gpu_scenes import SIZES, of_channels
 
 SPLATS = [{"BLOCK": block, "num_warps": warps} for block, warps in itertools.product((32, 64, 128, 256), (1, 2, 4)) if block >= 32 * warps]
 PRODUCTS = [{"K": k, "DB": d, "num_warps": w} for k, d, w in itertools.product((16, 32), (32, 64, 128), (4, 8))]
@@ -48,13 +48,11 @@ def main() -> int:
     from tsplat.kernels.launch import LAUNCHES, current_target
 
     only = {name: int(value) for name, value in (o.split("=") for o in args.only)}
-    scene, family = random_scene(args.splats, *SIZES[args.size]), current_target().family
+    family = current_target().family
     print(f"{torch.cuda.get_device_name()}, {args.splats} splats, {args.size}\n\n| kernel | constants | stage, ms | |\n| --- | --- | --- | --- |")
     for kernel in args.kernels:
         stage, channels, candidates = CANDIDATES[kernel]
-        g = torch.Generator().manual_seed(0)
-        some = scene._replace(colors=torch.rand(args.splats, channels, generator=g), background=torch.rand(channels, generator=g))
-        calls, _, _ = stage_calls(to(some, torch.device("cuda")))
+        calls, _, _ = stage_calls(of_channels(args.splats, args.size, channels).to("cuda"))
         stands = LAUNCHES[kernel][family]
         tried = [*(c for c in candidates if only.items() <= c.items()), stands]
         times = sorted((time(calls[stage], LAUNCHES[kernel], family, c, args.times), list(c.items()), c == stands) for c in tried)

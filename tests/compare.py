@@ -80,12 +80,13 @@ def threads(count: int) -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def guarded(tensor: Tensor | None) -> Tensor | None:
-    """The same numbers with NaN (or, for indices, numbers far out of range) before and after them in memory."""
+def guarded(tensor: Tensor | None, device: torch.device | str = "cpu") -> Tensor | None:
+    """The same numbers with NaN (for indices, numbers far out of range; for flags, True) before and after them in memory, so that a read out of
+    bounds shows."""
     if tensor is None:
         return None
-    fill = float("nan") if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max // 2
-    memory = torch.full((tensor.numel() + 128,), fill, dtype=tensor.dtype)
+    fill = math.nan if tensor.is_floating_point() else tensor.dtype == torch.bool or torch.iinfo(tensor.dtype).max // 2
+    memory = torch.full((tensor.numel() + 128,), fill, dtype=tensor.dtype, device=device)
     inner = memory[64:64 + tensor.numel()].view(tensor.shape)
     return inner.copy_(tensor)
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+import itertools
+import math
+from collections.abc import Callable, Iterator
 
 import pytest
 import scenes
 import torch
 import tsplat_reference as reference
-from compare import assert_close, guarded
+from compare import assert_close, guarded, strided
 from torch import Tensor
 
 pytest.importorskip("triton", reason="Triton is not installed here")
@@ -39,8 +41,8 @@ def case(cameras: int, n: int, width: int, height: int, *, dtype: torch.dtype = 
          drop_last: bool = False, **options: object) -> Case:
     s = scenes.splats2d(cameras, n, width, height, **options)  # type: ignore[arg-type]
     bins = reference.bin_splats(s.means2d, s.radii, s.conics, s.opacities, s.depths, width, height, TILE)
-    put = [None if x is None else guarded(x.to(dtype) if x.is_floating_point() else x).to(device) for x in s]
-    return Case(scenes.Splats2D(*put), reference.Bins(*(guarded(b).to(device) for b in bins)), width, height, drop_last)
+    put = [None if x is None else guarded(x.to(dtype) if x.is_floating_point() else x, device) for x in s]
+    return Case(scenes.Splats2D(*put), reference.Bins(*(guarded(b, device) for b in bins)), width, height, drop_last)
 
 
 @pytest.fixture
@@ -79,7 +81,7 @@ def test_forward_and_backward_agree_with_the_reference(name: str) -> None:
     assert_close([g.cpu() for g in got], want, 1e-12)
     v = [torch.randn_like(w) for w in want]
     v_want = reference.blend_blocks_backward(*cpu[:7], *want, *v, *cpu[7:], True)
-    v_got = blending.blend_backward(*c.arguments[:7], *(guarded(x).to(DEVICE) for x in (*want, *v)), *c.arguments[7:], True)
+    v_got = blending.blend_backward(*c.arguments[:7], *(guarded(x, DEVICE) for x in (*want, *v)), *c.arguments[7:], True)
     assert_close([g.cpu() for g in v_got], v_want, 1e-12)
 
 
@@ -129,16 +131,56 @@ BINNED = {"batch": (3, 40, 70, 41, {}), "large splats": (1, 10, 100, 37, {"size"
           "invisible": (2, 9, 33, 33, {})}
 
 
+def in_gaps(tensor: Tensor, device: str) -> Tensor:
+    """On a device, with NaN between the numbers."""
+    return strided(tensor.to(device))
+
+
+@pytest.mark.parametrize("memory", [guarded, in_gaps])
 @pytest.mark.parametrize("name", BINNED)
-def test_bins_are_those_of_the_reference(name: str) -> None:
+def test_bins_are_those_of_the_reference(name: str, memory: Callable[[Tensor, str], Tensor]) -> None:
     cameras, n, width, height, options = BINNED[name]
     s = scenes.splats2d(cameras, n, width, height, **options)
     radii = torch.zeros_like(s.radii) if name == "invisible" else s.radii
     arguments = s.means2d, radii, s.conics, s.opacities, s.depths
     want = reference.bin_splats(*arguments, width, height, TILE)
-    got = binning.bin_splats(*(guarded(x).to(DEVICE) for x in arguments), width, height, TILE)
+    put = [memory(x, DEVICE) for x in arguments]
+    got = binning.bin_splats(*put, width, height, TILE)
     assert torch.equal(got[0].cpu(), want.ids)
     assert torch.equal(got[1].cpu(), want.offsets)
+    ids, offsets, needed = binning.bin_splats_fixed(*put, width, height, TILE, len(want.ids) + 3)
+    assert torch.equal(ids[:len(want.ids)].cpu(), want.ids)
+    assert torch.equal(offsets.cpu(), want.offsets)
+    assert int(needed) == len(want.ids)
+
+
+@pytest.mark.parametrize("memory", [guarded, in_gaps])
+def test_lists_in_float32_go_front_to_back_and_equals_by_index(memory: Callable[[Tensor, str], Tensor]) -> None:
+    """The bits of a float are its key then: of either sign, and zeros of either sign, too."""
+    s = scenes.splats2d(2, 30, 20, 12, size=(2.0, 9.0))
+    depths = torch.randint(-3, 4, (2, 30), generator=scenes.generator(5)).float() * 1.5e3
+    depths[:, ::7] *= 0.0
+    arguments = s.means2d.float(), s.radii, s.conics.float(), s.opacities.float(), depths
+    ids, offsets = (x.cpu() for x in binning.bin_splats(*(memory(x, DEVICE) for x in arguments), 20, 12, TILE))
+    flat = depths.flatten().tolist()
+    assert {math.copysign(1.0, d) for d in flat if d == 0} == {1.0, -1.0}
+    lists = [ids[a:b].tolist() for a, b in itertools.pairwise(offsets.tolist())]
+    assert min(map(len, lists)) > 5
+    assert lists == [sorted(some, key=lambda i: (flat[i], i)) for some in lists]
+
+
+def test_tiles_beyond_32_bits() -> None:
+    """2^36 of them, in two images of 2^30 bins: their lists would not fit anywhere, but the hits of bins do."""
+    side, size = 1 << 15, 1 << 21
+    means2d = torch.tensor([[[0.5, 0.5], [size - 0.5, size - 0.5]], [[size - 0.5, 0.5], [size / 2 + 4.5, size - 0.5]]], dtype=torch.float64)
+    wanted = torch.tensor([0, side * side - 1, side * side + side - 1, 2 * side * side - side // 2])
+    radii, conics = torch.ones(2, 2, 2, dtype=torch.int32), torch.tensor([2.0, 0.0, 2.0], dtype=torch.float64).expand(2, 2, 3)
+    put = [guarded(x, DEVICE) for x in (radii, means2d, conics, torch.full((2, 2), 0.9, dtype=torch.float64), torch.arange(4, dtype=torch.int32),
+                                        torch.ones(4, dtype=torch.int32), torch.arange(1, 5))]
+    keys, ids = torch.zeros(4, dtype=torch.int64, device=DEVICE), torch.zeros(4, dtype=torch.int32, device=DEVICE)
+    binning.emit_kernel[(1,)](*put, keys, ids, 4, 2, size, size, side, side, 4, EPS=2.2e-16, TILE=TILE, SIDE=8, BLOCK=32)
+    assert torch.equal(keys.cpu() >> 32, wanted)
+    assert ids.tolist() == [0, 1, 2, 3]
 
 
 @pytest.mark.parametrize("spare", [0, 7, -20])
@@ -148,7 +190,7 @@ def test_fixed_capacity_reports_overflow_and_corrupts_nothing(spare: int) -> Non
     arguments = s.means2d, s.radii, s.conics, s.opacities, s.depths
     want = reference.bin_splats(*arguments, 50, 40, TILE)
     capacity = len(want.ids) + spare
-    ids, offsets, hits = binning.bin_splats_fixed(*(x.to(DEVICE) for x in arguments), 50, 40, TILE, capacity)
+    ids, offsets, hits = binning.bin_splats_fixed(*(guarded(x, DEVICE) for x in arguments), 50, 40, TILE, capacity)
     assert int(hits) == len(want.ids)
     assert ids.shape == (capacity,)
     assert int(offsets[-1]) == min(capacity, len(want.ids))

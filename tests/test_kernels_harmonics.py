@@ -9,7 +9,7 @@ import pytest
 import scenes
 import torch
 import tsplat_reference as reference
-from compare import assert_close, assert_same_bits, strided
+from compare import assert_close, assert_same_bits, guarded, strided
 from torch import Tensor
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -20,12 +20,6 @@ pytest.importorskip("triton", reason="Triton is not installed here")
 from tsplat.kernels.harmonics import harmonics, harmonics_backward  # noqa: E402
 
 Scene = tuple[Tensor, Tensor, Tensor, int, Tensor]
-
-
-def guarded(tensor: Tensor) -> Tensor:
-    """The same numbers, with NaN or True before and after them in memory, so that a read out of bounds shows."""
-    memory = torch.full((tensor.numel() + 128,), math.nan if tensor.is_floating_point() else True, dtype=tensor.dtype, device=DEVICE)
-    return memory[64:64 + tensor.numel()].view(tensor.shape).copy_(tensor)
 
 
 def scene(degree: int, channels: int = 3, cameras: int = 2, n: int = 9, extra: int = 0) -> Scene:
@@ -45,8 +39,8 @@ def upstream(args: Scene) -> Tensor:
 
 def run(args: Scene, dtype: torch.dtype = torch.float64) -> list[Tensor]:
     """Value and gradients of the kernels."""
-    means, centers, coeffs, v_out = (guarded(x.to(dtype)) for x in (*args[:3], upstream(args)))
-    mask = guarded(args[4])
+    means, centers, coeffs, v_out = (guarded(x.to(dtype), DEVICE) for x in (*args[:3], upstream(args)))
+    mask = guarded(args[4], DEVICE)
     return [harmonics(means, centers, coeffs, args[3], mask), *harmonics_backward(means, centers, coeffs, args[3], mask, v_out)]
 
 

@@ -10,7 +10,7 @@ import pytest
 import scenes
 import torch
 import tsplat_reference as reference
-from compare import assert_close, assert_same_bits, strided
+from compare import assert_close, assert_same_bits, guarded, strided
 from torch import Tensor
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
@@ -23,14 +23,7 @@ from tsplat.kernels.projection import project, project_backward  # noqa: E402
 MODELS = ("pinhole", "orthographic", "fisheye")
 
 
-def guarded(tensor: Tensor) -> Tensor:
-    """The same numbers, with NaN or huge integers before and after them in memory, so that a read out of bounds shows."""
-    fill = math.nan if tensor.is_floating_point() else torch.iinfo(tensor.dtype).max
-    memory = torch.full((tensor.numel() + 128,), fill, dtype=tensor.dtype, device=DEVICE)
-    return memory[64:64 + tensor.numel()].view(tensor.shape).copy_(tensor)
-
-
-def put(values: Any, function: Any = guarded) -> list[Any]:
+def put(values: Any, function: Any = lambda x: guarded(x, DEVICE)) -> list[Any]:
     """The values with a function applied to tensors."""
     return [function(v) if isinstance(v, Tensor) else v for v in values]
 
@@ -162,7 +155,7 @@ def test_the_arctangent_of_the_fisheye() -> None:
     args[5], args[6] = torch.eye(4, dtype=torch.float64)[None], torch.diag(torch.tensor([1.0, 1.0, 1.0], dtype=torch.float64))[None]
     u = project(*put(args))[1][0, :, 0].cpu()
     assert (u - torch.atan2(r, torch.ones_like(r))).abs().div(r.atan().clamp(min=1e-300)).max() < 1e-14
-    single = project(*put(args, lambda x: guarded(x.float())))[1][0, :, 0].cpu().double()
+    single = project(*put(args, lambda x: guarded(x.float(), DEVICE)))[1][0, :, 0].cpu().double()
     assert (single - torch.atan2(r, torch.ones_like(r))).abs().div(r.atan().clamp(min=1e-300)).max() < 1e-6
 
 
@@ -179,8 +172,8 @@ def test_float32_is_as_good_as_float32_can_be(model: str) -> None:
     args = put(arguments(*far_and_wide(model), antialiased=True), lambda x: x.float().double())
     want = reference.project(*args)
     back = backward_arguments(args, want)
-    single = [guarded(x.float() if x.is_floating_point() else x) if isinstance(x, Tensor) else x for x in back]
-    got = project(*put(args, lambda x: guarded(x.float())))
+    single = [guarded(x.float() if x.is_floating_point() else x, DEVICE) if isinstance(x, Tensor) else x for x in back]
+    got = project(*put(args, lambda x: guarded(x.float(), DEVICE)))
     assert all(x.dtype == torch.float32 for x in got[1:])
     assert ((got[0].cpu() - want.radii).abs() <= 1).all()                        # a half size may be a rounding from an integer
     assert torch.equal(got[0].cpu() > 0, want.radii > 0)
@@ -196,7 +189,7 @@ def test_needles_keep_their_width_in_float32() -> None:
     args = put(arguments(splats, cam, antialiased=True, eps2d=1e-4), lambda x: x.float().double())
     want = reference.project(*args)
     both = (want.radii > 0).all(-1)
-    _, _, _, conics, compensations = (x.cpu().double() for x in project(*put(args, lambda x: guarded(x.float()))))
+    _, _, _, conics, compensations = (x.cpu().double() for x in project(*put(args, lambda x: guarded(x.float(), DEVICE))))
     assert ((conics - want.conics).abs().amax(-1) / want.conics.abs().amax(-1))[both].max() < 1e-5
     assert ((compensations - want.compensations).abs() / want.compensations)[both].max() < 1e-5
 

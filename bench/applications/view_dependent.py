@@ -4,8 +4,8 @@
 
 The chair of the NeRF paper at 100x100 over a blue background: 100 views, and 13 held out. A random volume is reconstructed as in `head.py`.
 From there, plain colours go on, and, for as many steps, colours with five features more, to which a fully connected network, the same for
-all pixels, adds what it makes of features and viewing direction. Prints the held-out PSNR of both. The picture, in held-out views:
-plain colours, the network's.
+all pixels, adds what it makes of features and viewing direction; both by squared error. Prints the held-out PSNR of both. The picture, in held-out
+views: plain colours, the network's.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import time
 
 import torch
 from common import Spheres, Stage, Views, arguments, load_views, mean_psnr, optimise, report, write_rows
-from reconstruction import FINE_GAMMA, reconstruct
+from reconstruction import reconstruct
 from torch import Tensor, nn
 
 import tsplat
@@ -23,7 +23,9 @@ FEATURES = 8
 WIDTH = 32
 RADIUS, DISTANCE = 1.5, 4.03
 BACKGROUND = 0.1, 0.3, 0.9
-GAMMA = 3e-3, FINE_GAMMA[1]
+GAMMA = 3e-3
+SPEED = 0.3
+"""Of the geometry: at full learning rates the last steps lost 0.4 dB."""
 
 
 def directions(camera: tsplat.Camera) -> Tensor:
@@ -75,15 +77,15 @@ def main(argv: list[str] | None = None) -> tuple[float, float]:
         stage = stage_of(channels)
         extra = 0.1 * torch.randn(len(geometry), channels - 3, generator=generator)
         spheres = geometry.with_features(torch.cat([geometry.features.detach(), extra], 1))
-        groups = [*spheres.groups(RADIUS / 4), {"params": list(shader.parameters()), "lr": 2e-3}]
+        groups = [*spheres.groups(RADIUS / 4, SPEED), {"params": list(shader.parameters()), "lr": 5e-3}]
         batches = torch.Generator().manual_seed(args.seed)                                  # the same for both
 
         def loss(some: Views, gamma: float) -> Tensor:
-            return (shader(stage.render(spheres, some.cameras, gamma), some.cameras) - some.images).abs().mean()
+            return (shader(stage.render(spheres, some.cameras, gamma), some.cameras) - some.images).square().mean()
 
-        optimise([group for group in groups if group["params"]], train, loss, steps=args.steps, batch=args.batch, gamma=GAMMA, generator=batches,
-                 name=type(shader).__name__)
-        return stage, spheres, mean_psnr(lambda camera: shader(stage.render(spheres, camera, GAMMA[1]), camera), test)
+        optimise([group for group in groups if group["params"]], train, loss, steps=args.steps, batch=args.batch, gamma=(GAMMA, GAMMA),
+                 generator=batches, name=type(shader).__name__)
+        return stage, spheres, mean_psnr(lambda camera: shader(stage.render(spheres, camera, GAMMA), camera), test)
 
     shaders = Plain(), Shader(FEATURES)
     results = [fit(shader, channels) for shader, channels in zip(shaders, (3, FEATURES), strict=True)]
@@ -92,7 +94,7 @@ def main(argv: list[str] | None = None) -> tuple[float, float]:
           "viewing direction")
     some = test[torch.arange(0, len(test), 3)[:5]]
     with torch.no_grad():
-        rows = [[shader(stage.render(spheres, camera, GAMMA[1]), camera) for camera, _ in some.each()]
+        rows = [[shader(stage.render(spheres, camera, GAMMA), camera) for camera, _ in some.each()]
                 for shader, (stage, spheres, _) in zip(shaders, results, strict=True)]
     write_rows(args.picture, rows, some.images if args.targets else None)
     report(start, args.picture)

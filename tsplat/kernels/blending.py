@@ -21,7 +21,6 @@ from tsplat.kernels.tiles import (
     block_pixels,
     blocks,
     glue,
-    half_pixels,
     halves,
     lane_x,
     load_batch,
@@ -31,7 +30,7 @@ from tsplat.kernels.tiles import (
     prefetch_records,
     row_dot,
     row_moments,
-    store_channels,
+    store_half,
     tile_list,
 )
 
@@ -149,18 +148,13 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
         C1 += T * tl.load(b + 1, mask=D > 1, other=0.0)
         C2 += T * tl.load(b + 2, mask=D > 2, other=0.0)
         C3 += T * tl.load(b + 3, mask=D > 3, other=0.0)
-    # in halves, as all at once would take more registers than the loop
-    first, pixel, inside = half_pixels(view, left, top, W, H, 0)
     C0, D0 = halves(C0)
     C1, D1 = halves(C1)
     C2, D2 = halves(C2)
     C3, D3 = halves(C3)
     T, U = halves(T)
-    store_channels(image + first * D, C0, C1, C2, C3, pixel, inside, D)
-    tl.store(alphas + first + pixel, 1.0 - T, mask=inside)
-    first, pixel, inside = half_pixels(view, left, top, W, H, 4)
-    store_channels(image + first * D, D0, D1, D2, D3, pixel, inside, D)
-    tl.store(alphas + first + pixel, 1.0 - U, mask=inside)
+    store_half(image, alphas, None, C0, C1, C2, C3, 1.0 - T, None, view, left, top, W, H, 0, D)
+    store_half(image, alphas, None, D0, D1, D2, D3, 1.0 - U, None, view, left, top, W, H, 4, D)
 
 
 @Launcher

@@ -54,6 +54,19 @@ def chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha: tl.co
     return splat, mx, my, l00, l10, l11, alpha, front * alpha, after
 
 
+@triton.jit
+def add_moments(sums, index, s0, s1, s2, s3, s4, s5, real):
+    """Six sums `[1, K]` to the rows `[K]` of sums, by atomics."""
+    q = (sums + index * SUMS)[None, :]
+    mask = real[None, :]
+    tl.atomic_add(q, s0, mask=mask, sem="relaxed")
+    tl.atomic_add(q + 1, s1, mask=mask, sem="relaxed")
+    tl.atomic_add(q + 2, s2, mask=mask, sem="relaxed")
+    tl.atomic_add(q + 3, s3, mask=mask, sem="relaxed")
+    tl.atomic_add(q + 4, s4, mask=mask, sem="relaxed")
+    tl.atomic_add(q + 5, s5, mask=mask, sem="relaxed")
+
+
 @Launcher
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null", "N", "D"])
 def feature_fwd_kernel(records, colors, ids, offsets, backgrounds, image, alphas, W, H, tiles_x, tiles_y, null, N, D,
@@ -151,15 +164,10 @@ def feature_bwd_kernel(records, colors, ids, offsets, rest_image, v_weights, v_i
         v = tl.where(alpha < tl.full((), ALPHA_MAX, dt), v, 0.0)
         rest -= tl.sum(wg, 1)
         s0, sx, sy, sxx, sxy, syy = block_moments(v, mx, my, x, y)
-        q = (sums + splat * SUMS)[None, :]
-        mask = real[None, :]
-        tl.atomic_add(q, s0, mask=mask, sem="relaxed")
-        tl.atomic_add(q + 1, sx, mask=mask, sem="relaxed")
-        tl.atomic_add(q + 2, sy, mask=mask, sem="relaxed")
-        tl.atomic_add(q + 3, sxx, mask=mask, sem="relaxed")
-        tl.atomic_add(q + 4, sxy, mask=mask, sem="relaxed")
-        tl.atomic_add(q + 5, syy, mask=mask, sem="relaxed")
+        add_moments(sums, splat, s0, sx, sy, sxx, sxy, syy, real)
         if ABSGRAD:
+            q = (sums + splat * SUMS)[None, :]
+            mask = real[None, :]
             slope_x, slope_y = mean_slopes(mx, my, l00, l10, l11, x, y)
             tl.atomic_add(q + 10, tl.sum(tl.abs(v * slope_x), 0, keep_dims=True), mask=mask, sem="relaxed")
             tl.atomic_add(q + 11, tl.sum(tl.abs(v * slope_y), 0, keep_dims=True), mask=mask, sem="relaxed")

@@ -9,8 +9,7 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from tsplat.kernels.feature_blending import tile_pixels
-from tsplat.kernels.footprint import SUMS
+from tsplat.kernels.feature_blending import add_moments, tile_pixels
 from tsplat.kernels.launch import Launcher
 from tsplat.kernels.sphere_geometry import LOG2E, depth_slope, enter, far_off, rays, reciprocal, term, term_gradients
 
@@ -76,9 +75,18 @@ def sphere_feature_fwd_kernel(records, features, ids, offsets, backgrounds, gamm
 
 
 @triton.jit
-def past_logsumexp(logsumexp, first, pixel, inside, dt: tl.constexpr):
-    """To base 2, `[P, 1]`; infinite beyond the border, so that all terms are 0 there."""
-    return (tl.load(logsumexp + first + pixel, mask=inside, other=float("inf")) * tl.full((), LOG2E, dt))[:, None]
+def backward_tile(tile, Ks, gamma, near, far, cutoff, logsumexp, tiles_x, tiles_y, W, H, dt: tl.constexpr, ORTHO: tl.constexpr, P: tl.constexpr):
+    """Of a tile's pixels: x `[P, 1]`, the index of the first and of the others from there, which exist, and their rays; near, far, the line that
+    takes depth to the logarithm of a term, to base 2; that of the sum `[P, 1]`, infinite beyond the border, so that all terms are 0 there; and the
+    farthest depth of a hit."""
+    view, x, y, cx, cy, first, pixel, inside = tile_pixels(tile, tiles_x, tiles_y, W, H, dt, P)
+    mx, my, w, w2 = rays(Ks, view, x + cx, y + cy, ORTHO)
+    n, f, level, slope, scale = depth_slope(gamma, near, far, dt)
+    lse = (tl.load(logsumexp + first + pixel, mask=inside, other=float("inf")) * tl.full((), LOG2E, dt))[:, None]
+    last = f
+    if cutoff is not None:
+        last = tl.minimum(tl.load(cutoff + first + pixel, mask=inside, other=0.0), f)[:, None]
+    return x, first, pixel, inside, mx, my, w, w2, n, f, level, slope, lse, last
 
 
 @Launcher
@@ -89,16 +97,11 @@ def sphere_features_bwd_kernel(records, ids, offsets, used, gamma, Ks, cutoff, l
     """DB channels of the gradient of the features, by atomics: weights^T times the image's gradient, which stays at hand for all spheres."""
     dt: tl.constexpr = records.dtype.element_ty
     tile = tl.program_id(0)
-    view, x, y, cx, cy, first, pixel, inside = tile_pixels(tile, tiles_x, tiles_y, W, H, dt, P)
-    mx, my, w, w2 = rays(Ks, view, x + cx, y + cy, ORTHO)
-    n, f, level, slope, scale = depth_slope(gamma, near, far, dt)
+    x, first, pixel, inside, mx, my, w, w2, n, f, level, slope, lse, last = backward_tile(
+        tile, Ks, gamma, near, far, cutoff, logsumexp, tiles_x, tiles_y, W, H, dt, ORTHO, P)
     d = tl.program_id(1) * DB + tl.arange(0, DB)
     real_d = (d < D)[:, None]
     V = tl.load(v_image + first * D + (pixel[None, :] * D + d[:, None]), mask=inside[None, :] & real_d, other=0.0)             # [DB, P]
-    lse = past_logsumexp(logsumexp, first, pixel, inside, dt)
-    last = f
-    if cutoff is not None:
-        last = tl.minimum(tl.load(cutoff + first + pixel, mask=inside, other=0.0), f)[:, None]
     i = tl.load(offsets + tile)
     end = i + tl.load(used + tile)
     while i < end:
@@ -122,20 +125,15 @@ def sphere_feature_bwd_kernel(records, features, ids, offsets, used, gamma, Ks, 
     """Sums `[R + 1, SUMS]` of the geometry, by atomics, and v_rays (or None) `[tiles, 4]`; as `sphere_bwd_kernel`, with K spheres at a time."""
     dt: tl.constexpr = records.dtype.element_ty
     tile = tl.program_id(0)
-    view, x, y, cx, cy, first, pixel, inside = tile_pixels(tile, tiles_x, tiles_y, W, H, dt, P)
-    mx, my, w, w2 = rays(Ks, view, x + cx, y + cy, ORTHO)
-    n, f, level, slope, scale = depth_slope(gamma, near, far, dt)
+    x, first, pixel, inside, mx, my, w, w2, n, f, level, slope, lse, last = backward_tile(
+        tile, Ks, gamma, near, far, cutoff, logsumexp, tiles_x, tiles_y, W, H, dt, ORTHO, P)
     inv_gamma = 1.0 / tl.load(gamma)
     depth1 = 1.0 / (f - n)
     depth0 = 1.0 + n * depth1
     base = tl.load(common + first + pixel, mask=inside, other=0.0)[:, None]
-    lse = past_logsumexp(logsumexp, first, pixel, inside, dt)
     v_z = None
     if v_depth is not None:
         v_z = tl.load(v_depth + first + pixel, mask=inside, other=0.0)[:, None]
-    last = f
-    if cutoff is not None:
-        last = tl.minimum(tl.load(cutoff + first + pixel, mask=inside, other=0.0), f)[:, None]
     v_mx = x * 0.0
     v_my = x * 0.0
     i = tl.load(offsets + tile)
@@ -165,14 +163,7 @@ def sphere_feature_bwd_kernel(records, features, ids, offsets, used, gamma, Ks, 
         if v_rays is not None:
             v_mx += tl.sum(pixel_mx, 1, keep_dims=True)
             v_my += tl.sum(pixel_my, 1, keep_dims=True)
-        q = (sums + index * SUMS)[None, :]
-        mask = real[None, :]
-        tl.atomic_add(q, s0, mask=mask, sem="relaxed")
-        tl.atomic_add(q + 1, s1, mask=mask, sem="relaxed")
-        tl.atomic_add(q + 2, s2, mask=mask, sem="relaxed")
-        tl.atomic_add(q + 3, s3, mask=mask, sem="relaxed")
-        tl.atomic_add(q + 4, s4, mask=mask, sem="relaxed")
-        tl.atomic_add(q + 5, s5, mask=mask, sem="relaxed")
+        add_moments(sums, index, s0, s1, s2, s3, s4, s5, real)
         i += K
     if v_rays is not None:
         q = v_rays + tile.to(tl.int64) * 4

@@ -35,7 +35,6 @@ from tsplat.kernels.tiles import (
     block_pixels,
     blocks,
     glue,
-    half_pixels,
     halves,
     lane_x,
     load_batch,
@@ -43,7 +42,7 @@ from tsplat.kernels.tiles import (
     of_batch,
     prefetch_records,
     row_dot,
-    store_channels,
+    store_half,
     tile_list,
     tile_min,
 )
@@ -118,23 +117,15 @@ def sphere_fwd_kernel(records, ids, offsets, backgrounds, gamma, Ks, image, dept
     tl.store(used + tile, hits, mask=exists & (tl.arange(0, LANES)[:, None] % TILE == 0))
     inverse = 1.0 / total
     peak = (peak + tl.log2(total)) / tl.full((), LOG2E, dt)
-    # in halves, as all at once would take more registers than the loop
-    first, pixel, inside = half_pixels(view, left, top, W, H, 0)
     C0, D0 = halves(C0 * inverse)
     C1, D1 = halves(C1 * inverse)
     C2, D2 = halves(C2 * inverse)
     C3, D3 = halves(C3 * inverse)
     peak, peak1 = halves(peak)
     Z, Z1 = halves(Z * inverse)
-    store_channels(image + first * D, C0, C1, C2, C3, pixel, inside, D)
-    tl.store(logsumexp + first + pixel, peak, mask=inside)
-    if DEPTH:
-        tl.store(depths + first + pixel, Z, mask=inside)
-    first, pixel, inside = half_pixels(view, left, top, W, H, 4)
-    store_channels(image + first * D, D0, D1, D2, D3, pixel, inside, D)
-    tl.store(logsumexp + first + pixel, peak1, mask=inside)
-    if DEPTH:
-        tl.store(depths + first + pixel, Z1, mask=inside)
+    other = depths if DEPTH else None
+    store_half(image, logsumexp, other, C0, C1, C2, C3, peak, Z, view, left, top, W, H, 0, D)
+    store_half(image, logsumexp, other, D0, D1, D2, D3, peak1, Z1, view, left, top, W, H, 4, D)
 
 
 @Launcher

@@ -132,6 +132,17 @@ def store_channels(p, v0, v1, v2, v3, pixel, inside, D: tl.constexpr):
 
 
 @triton.jit
+def store_half(image, plane, other, C0, C1, C2, C3, value, other_value, view, left, top, W, H, begin: tl.constexpr, D: tl.constexpr):
+    """4 pixels of each lane's row, from `begin`: D channels of an image `[C, H, W, D]`, and a number of a plane `[C, H, W]`, or two (other: or
+    None). All 8 pixels at once would take more registers than the loops do."""
+    first, pixel, inside = half_pixels(view, left, top, W, H, begin)
+    store_channels(image + first * D, C0, C1, C2, C3, pixel, inside, D)
+    tl.store(plane + first + pixel, value, mask=inside)
+    if other is not None:
+        tl.store(other + first + pixel, other_value, mask=inside)
+
+
+@triton.jit
 def tile_list(offsets, tile, exists):
     """Where each lane's list begins, its length, and the length of the longest of the block."""
     start = tl.load(offsets + tile, mask=exists, other=0)

@@ -1,0 +1,109 @@
+"""The renderer in compiled code, exported, and mapped: `torch.compile`, `torch.export`, `torch.func.vmap`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import scenes
+import torch
+from backends import Backend
+from compare import assert_close, assert_same_bits, gradients, leaves
+from op_cases import HEIGHT, WIDTH, case, render, render_arguments
+from torch import Tensor
+from torch._dynamo.testing import CompileCounterWithBackend
+
+import tsplat
+from tsplat import Camera, ops
+
+WITHOUT_INTERPRETER = True           # minutes there: test_kernels_ops.py takes a selection
+
+
+@pytest.fixture
+def fresh_dynamo() -> Iterator[None]:
+    """Without what other tests compiled."""
+    torch._dynamo.reset()
+    yield
+    torch._dynamo.reset()
+
+
+@pytest.mark.usefixtures("fresh_dynamo")
+def test_the_renderer_compiles_whole_with_its_gradients(backend: Backend) -> None:
+    """The screen-space gradient that density control needs (that of the zero offset, the last argument) included."""
+    args = render_arguments(backend)
+    want = render(*args)
+    got = torch.compile(render, fullgraph=True, backend="aot_eager", dynamic=False)(*args)
+    assert_same_bits(got, want)
+    v_got, v_want = gradients(got, args), gradients(want, args)
+    assert_close(v_got, v_want, 1e-14)
+    assert (v_got[-1] != 0).any()
+
+
+@pytest.mark.usefixtures("fresh_dynamo")
+def test_one_compilation_serves_all_sizes(backend: Backend) -> None:
+    """Of splats and of the image, the gradient included; numbers of hits differ, too."""
+    counter = CompileCounterWithBackend("aot_eager")
+    compiled = torch.compile(render, fullgraph=True, backend=counter, dynamic=True)
+    counts = []
+    for n, width, height in ((6, 10, 9), (9, 10, 9), (14, 33, 17), (5, 12, 30)):
+        args = render_arguments(backend, n, width, height)
+        got, want = compiled(*args, width, height), render(*args, width, height)
+        assert_same_bits(got, want)
+        assert_close(gradients(got, args), gradients(want, args), 1e-14)
+        counts.append(counter.frame_count)  # the first compilation may make several attempts
+    assert counts == [counts[0]] * 4
+
+
+@pytest.mark.usefixtures("fresh_dynamo")
+def test_a_camera_object_passes_into_compiled_code(backend: Backend) -> None:
+    s, cam = scenes.splats(6), scenes.camera(None, WIDTH, HEIGHT, model="fisheye")
+    s, cam = backend.put((s, cam))
+
+    def shot(splats: scenes.Splats3D, camera: Camera) -> tuple[Tensor, Tensor]:
+        r = tsplat.rasterize(*splats, camera)
+        return r.image, r.meta.hits
+
+    assert_same_bits(torch.compile(shot, fullgraph=True, backend="aot_eager")(s, cam), shot(s, cam))
+
+
+class Model(torch.nn.Module):
+    """Parameters that render themselves."""
+
+    def __init__(self, *parameters: Tensor) -> None:
+        super().__init__()
+        self.parameters_ = torch.nn.ParameterList([p.detach() for p in parameters])
+
+    def forward(self, viewmats: Tensor, Ks: Tensor) -> Tensor:
+        """The image."""
+        return tsplat.rasterize(*self.parameters_, Camera(viewmats, Ks, WIDTH, HEIGHT), sh_degree=1).image
+
+
+@pytest.mark.parametrize("strict", [False, True])
+@pytest.mark.usefixtures("fresh_dynamo")
+def test_a_model_that_renders_exports(backend: Backend, strict: bool) -> None:
+    *parameters, viewmats, Ks, _, _ = (x.detach() for x in render_arguments(backend))
+    model = Model(*parameters)
+    program = torch.export.export(model, (viewmats, Ks), strict=strict)
+    names = {str(node.target) for node in program.graph.nodes}
+    assert {f"tsplat.{stage}.default" for stage in ("project", "harmonics", "bin_splats", "blend")} <= names
+    other = viewmats.flip(0).clone()
+    other[:, 0, 3] += 0.3  # another number of hits than when it was traced
+    assert_same_bits([program.module()(other, Ks)], [model(other, Ks)])
+
+
+def test_vmap_over_cameras_is_the_batch(backend: Backend) -> None:
+    _, args = case("project", backend)
+    viewmats, Ks = args[5:7]
+    mapped = torch.func.vmap(lambda v, K: ops.project(*args[:5], v[None], K[None], *args[7:]))(viewmats, Ks)
+    assert_same_bits([x[:, 0] for x in mapped], ops.project(*args))
+    _, (means, centers, coeffs, degree, mask) = case("harmonics", backend)
+    colors = torch.func.vmap(lambda c, m: ops.harmonics(means, c[None], coeffs, degree, m[None]))(centers, mask)
+    assert_close(colors[:, 0], ops.harmonics(means, centers, coeffs, degree, mask), 1e-15)
+
+
+def test_gradients_through_vmap_are_those_of_the_batch(backend: Backend) -> None:
+    _, args = case("project", backend)
+    inputs = leaves(*args[5:7])
+    mapped = torch.func.vmap(lambda v, K: ops.project(*args[:5], v[None], K[None], *args[7:]))(*inputs)
+    batch = ops.project(*args[:5], *inputs, *args[7:])
+    assert_close(gradients([x[:, 0] for x in mapped[1:]], inputs), gradients(batch[1:], inputs), 1e-15)

@@ -108,7 +108,8 @@ def _splats(block: int, num_warps: int) -> dict[str, int]:
 # one needs no step from warp to warp, and sums of more blocks to add up are a percent or two of what is read anyway. (project_backward in two
 # warps spills on sm_120.) pick: a count of BLOCK must fit a byte. blend: a warp takes 4 tiles (8 of 64 lanes). adam: BLOCK numbers of a
 # program, in whole rows: 8 a thread, in 16-byte loads. may_see: as project, untimed. features: splats and channels
-# of a matrix product; in 4 warps the forward was faster on an H100, but spills on sm_120. All columns but NVIDIA's are untimed.
+# of a matrix product; in 4 warps the forward was faster on an H100, but spills on sm_120, and so does the
+# backward of spheres on sm_100, with gradients of cameras. All columns but NVIDIA's are untimed.
 LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "project": {"nvidia": _splats(128, 4), "cdna": _splats(128, 2), "rdna": _splats(128, 4)},
     "project_backward": {"nvidia": _splats(128, 4), "cdna": _splats(64, 1), "rdna": _splats(32, 1)},
@@ -135,6 +136,8 @@ LAUNCHES: dict[str, dict[str, dict[str, int]]] = {
     "sphere_features_backward": {"nvidia": {"K": 16, "DB": 32, "num_warps": 4}, "cdna": {"K": 16, "DB": 32, "num_warps": 4},
                                  "rdna": {"K": 16, "DB": 16, "num_warps": 8}},
     "sphere_feature_backward": {family: {"K": 16, "DB": 32, "num_warps": 4} for family in FAMILIES},
+    "sphere_feature_cameras_backward": {"nvidia": {"K": 16, "DB": 32, "num_warps": 8}, "cdna": {"K": 16, "DB": 32, "num_warps": 4},
+                                        "rdna": {"K": 16, "DB": 32, "num_warps": 4}},
     "upstream": {family: {"DB": 4, **_splats(128, 4)} for family in FAMILIES},
 }
 

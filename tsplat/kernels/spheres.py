@@ -316,9 +316,10 @@ def _terms_backward(s: Spheres, radii: Tensor, opacities: Tensor, gamma: Tensor,
         sphere_features_bwd_kernel[(s.tiles, ceil_div(s.D, options["DB"]))](
             s.records, s.ids, s.offsets, used, gamma, s.Ks, cutoff, logsumexp, v_image, v_features, *size, rows, s.D, near, far, **block,
             **options)
+        feature_backward = "sphere_feature_backward" if v_rays is None else "sphere_feature_cameras_backward"
         sphere_feature_bwd_kernel[(s.tiles,)](
             s.records, s.features, s.ids, s.offsets, used, gamma, s.Ks, cutoff, logsumexp, common, v_image, v_depth, sums, v_rays, *size, rows,
-            s.D, near, far, EPS=eps, **block, **launch("sphere_feature_backward"))
+            s.D, near, far, EPS=eps, **block, **launch(feature_backward))
     *gradients, v_some = s.gradients(sums[:s.R], radii, opacities)
     return [v_some if v_features is None else v_features, *gradients, sums[:s.R, 5].sum(), _intrinsics_gradient(s.Ks, v_rays)]
 

@@ -3,9 +3,10 @@
     python bench/cpu.py               # the table of all scenes, how time grows, and the memory of 1M splats at 1920x1080
     python bench/cpu.py --quick       # two rows
 
-Each row gives forward and forward+backward in ms (median of 5, float32; backward to means, scales, quats, colours and opacities), blended
-pairs per second over `torch.exp` per second, measured in cache, before and after, in the same process and with the same threads, and the
-time of the best C++ rival (OpenSplat 2026, 2 threads) scaled by the exp rates of its machine (3.4 G/s) and of this one.
+Each row gives forward and forward+backward in ms (median of 9, float32; backward to means, scales, quats, colours and opacities), blended
+pairs per second over `torch.exp` per second, measured in cache, in the same process and with the same threads, and the time of the best C++ rival
+(OpenSplat 2026, 2 threads) scaled by the exp rates of its machine (3.4 G/s) and of this one. How fast a shared machine is changes by half within
+seconds, so that the rate is measured right before and right after each sample, and what is compared is the median of time times rate.
 """
 
 from __future__ import annotations
@@ -38,17 +39,26 @@ def exp_rate() -> float:
     """`torch.exp` per second on arguments that stay in the cache."""
     x = torch.rand(1 << 16) - 5
     out = torch.empty_like(x)
-    return x.numel() / median_seconds(lambda: [torch.exp(x, out=out) for _ in range(50)], 9) * 50
+    torch.exp(x, out=out)
+    return x.numel() / statistics.median(seconds(lambda: [torch.exp(x, out=out) for _ in range(50)]) for _ in range(3)) * 50
 
 
-def median_seconds(run: Callable[[], object], times: int) -> float:
+def seconds(run: Callable[[], object]) -> float:
+    """Of one call."""
+    start = time.perf_counter()
     run()
-    samples = []
+    return time.perf_counter() - start
+
+
+def samples(run: Callable[[], object], times: int) -> tuple[float, float]:
+    """Medians of the milliseconds of a call, and of as many `torch.exp` as the machine made in that time."""
+    run()
+    taken, exps = [], []
     for _ in range(times):
-        start = time.perf_counter()
-        run()
-        samples.append(time.perf_counter() - start)
-    return statistics.median(samples)
+        before, duration = exp_rate(), seconds(run)
+        taken.append(1e3 * duration)
+        exps.append(duration * (before + exp_rate()) / 2)
+    return statistics.median(taken), statistics.median(exps)
 
 
 def forward(scene: Scene) -> None:
@@ -62,13 +72,13 @@ def forward_backward(scene: Scene, v_image: torch.Tensor) -> None:
     torch.autograd.grad(image, leaves, v_image)
 
 
-def measure(width: int, height: int, n: int, times: int = 5) -> dict[str, float]:
+def measure(width: int, height: int, n: int, times: int = 9) -> dict[str, float]:
     scene = random_scene(n, width, height)
     v_image = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(0))
-    before = exp_rate()
-    ms = [1e3 * median_seconds(run, times) for run in (lambda: forward(scene), lambda: forward_backward(scene, v_image))]
-    rate = (before + exp_rate()) / 2
-    return {"width": width, "height": height, "n": n, "forward_ms": ms[0], "both_ms": ms[1], "exp_rate": rate}
+    (forward_ms, forward_exps), (both_ms, both_exps) = (samples(run, times) for run in (
+        lambda: forward(scene), lambda: forward_backward(scene, v_image)))
+    return {"width": width, "height": height, "n": n, "forward_ms": forward_ms, "both_ms": both_ms, "forward_exps": forward_exps,
+            "both_exps": both_exps}
 
 
 def table(rows: list[tuple[int, int, int]]) -> list[dict[str, float]]:
@@ -78,12 +88,11 @@ def table(rows: list[tuple[int, int, int]]) -> list[dict[str, float]]:
     for width, height, n in rows:
         row = measure(width, height, n)
         pairs = row["pairs"] = count_pairs(random_scene(n, width, height))
-        f, b, scale = row["forward_ms"], row["both_ms"], RIVAL_EXP_RATE / row["exp_rate"]
-        rival = [ms * scale for ms in RIVAL_MS[width, height, n]]
-        row["rival_ms"] = rival
-        print(f"| {width}x{height} | {n:,} | {pairs / 1e6:.2f} | {f:.0f} | {b:.0f} | {pairs / f / 1e3:.0f} | {pairs / b / 1e3:.0f} | "
-              f"{pairs / f * 1e3 / row['exp_rate']:.4f} | {pairs / b * 1e3 / row['exp_rate']:.4f} | {rival[0]:.0f} / {rival[1]:.0f} | "
-              f"{f / rival[0]:.2f} / {b / rival[1]:.2f} |", flush=True)
+        ms, exps = (row["forward_ms"], row["both_ms"]), (row["forward_exps"], row["both_exps"])
+        ratios = [ours / (1e-3 * rival * RIVAL_EXP_RATE) for ours, rival in zip(exps, RIVAL_MS[width, height, n], strict=True)]
+        row["rival_ms"] = rival = [ours / ratio for ours, ratio in zip(ms, ratios, strict=True)]
+        print(f"| {width}x{height} | {n:,} | {pairs / 1e6:.2f} | {ms[0]:.0f} | {ms[1]:.0f} | {pairs / ms[0] / 1e3:.0f} | {pairs / ms[1] / 1e3:.0f} | "
+              f"{pairs / exps[0]:.4f} | {pairs / exps[1]:.4f} | {rival[0]:.0f} / {rival[1]:.0f} | {ratios[0]:.2f} / {ratios[1]:.2f} |", flush=True)
         results.append(row)
     return results
 

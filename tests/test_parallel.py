@@ -182,16 +182,17 @@ import resource, torch, tsplat_reference
 torch.set_num_threads(1)
 def faults():
     before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    [torch.ones(1_500_000) for _ in range(3)]
+    [torch.ones(1_500_000) for _ in range(8)]
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-print(sum([faults() for _ in range(12)][8:]))
+faults()
+print(faults() + faults())
 """
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is glibc whose freed memory goes back to the system")
 def test_freed_memory_stays_with_the_process() -> None:
-    """Four times 18 MB are 17,600 pages: each would be a fault, were freed memory given back. (The first rounds still find their place.)"""
+    """Eight arrays are 11,719 pages. Made again twice, they have 1,500 to 8,800 faults, or 13,000 to 22,000, were freed memory given back."""
     environment = {**{k: v for k, v in os.environ.items() if not k.startswith(("MALLOC_", "GLIBC_"))},
                    "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "reference")])}
     run = subprocess.run([sys.executable, "-W", "ignore", "-c", FAULTS], env=environment, timeout=60, check=True, capture_output=True, text=True)
-    assert int(run.stdout) < 1000
+    assert int(run.stdout) < 11_000

@@ -25,6 +25,12 @@ def test_rate_of_the_means_falls_log_linearly(config: Make) -> None:
     assert learning_rates(config(steps=1), 1.0, 0)["quats"] == pytest.approx(6 * config(steps=1).lr_quats)      # raised no further
 
 
+def test_rates_rise_with_the_square_root_of_the_photos_of_a_step(config: Make) -> None:
+    c = config(steps=30_000)
+    twice = {name: 2 * rate for name, rate in learning_rates(c, 1.0, 0).items()}
+    assert learning_rates(c, 1.0, 0, photos=4) == pytest.approx(twice)
+
+
 def test_schedules_stretch_over_the_steps(config: Make) -> None:
     short, long = config(steps=1001), config(steps=4001)               # 4 times the steps, half the rates
     for part in range(5):

@@ -111,7 +111,8 @@ OFFLOAD: Columns = {
 def sections(report: Row) -> list[tuple[str, Columns, list[Row]]]:
     """Title, columns and rows of what a document has."""
     if "fits" in report:
-        return [(f"Quality on held-out photos: {report['capture']}, {report['config'].get('primitive', 'gaussians')}", QUALITY, [report])]
+        title = f"Quality on held-out photos: {report['capture']}, {report['config'].get('primitive', 'gaussians')}, commit {report['commit']}"
+        return [(title, QUALITY, [report])]
     if any("fits" in run for run in report.get("runs", [])):
         return [("Quality on a GPU, by rasteriser", PEERS, [run for run in report["runs"] if "fits" in run])]
     if "runs" in report:                                  # several commits on one machine

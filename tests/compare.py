@@ -14,6 +14,9 @@ from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
+SMALL_BLOCKS = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "FEW": 1 << 6, "GROUP_TILES": 1}
+"""Constants of `tsplat_reference.walk` with which little of a block's working memory is constant."""
+
 
 def error(got: Tensor, want: Tensor) -> float:
     """Largest difference, in units of the largest wanted magnitude (absolute where all are 0); infinite for NaN."""

@@ -12,7 +12,7 @@ import scenes
 import torch
 import tsplat_reference as reference
 from backends import Backend
-from compare import Peak, assert_close, assert_same_bits, gradients, leaves, strided, threads
+from compare import SMALL_BLOCKS, Peak, assert_close, assert_same_bits, gradients, leaves, strided, threads
 from torch import Tensor
 from tsplat_reference import blending, footprint, walk
 
@@ -363,10 +363,9 @@ def test_working_memory_does_not_grow_with_the_pairs_of_pixels_and_splats(monkey
     Measured 14 numbers for each splat and each pixel in the forward, 27 and 13 in the backward.
     """
     by_default = peaks(100, 24)
-    constants = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "FEW": 1 << 6, "GROUP_TILES": 1}
-    for name, value in constants.items():
+    for name, value in SMALL_BLOCKS.items():
         monkeypatch.setattr(walk, name, value)
     for n, side in ((100, 24), (400, 24), (100, 48)):  # of which each but the first has four times the pairs
-        allowed = 30 * n + 16 * side * side + 5 * constants["BLOCK"] + 100 * constants["GROUP"]
+        allowed = 30 * n + 16 * side * side + 5 * SMALL_BLOCKS["BLOCK"] + 100 * SMALL_BLOCKS["GROUP"]
         assert max(peaks(n, side)) < allowed
         assert min(by_default) > 4 * allowed                                      # the measure does see the working memory

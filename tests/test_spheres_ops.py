@@ -10,7 +10,7 @@ import scenes
 import torch
 import tsplat_reference as reference
 from backends import Backend
-from compare import Peak, assert_close, assert_same_bits, gradients, leaves, strided, threads
+from compare import SMALL_BLOCKS, Peak, assert_close, assert_same_bits, gradients, leaves, strided, threads
 from sphere_cases import FAR, NEAR, early_end, options
 from torch import Tensor
 from torch.autograd import gradcheck, gradgradcheck
@@ -73,11 +73,10 @@ def peaks(n: int, side: int) -> int:
 def test_working_memory_does_not_grow_with_the_pairs_of_pixels_and_spheres(monkeypatch: pytest.MonkeyPatch) -> None:
     """Some numbers for each sphere, for each pixel and channel, and constants; here with small constants, and every sphere on every pixel."""
     by_default = peaks(100, 24)
-    constants = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "FEW": 1 << 6, "GROUP_TILES": 1}
-    for name, value in constants.items():
+    for name, value in SMALL_BLOCKS.items():
         monkeypatch.setattr(walk, name, value)
     for n, side in ((100, 24), (400, 24), (100, 48)):  # of which each but the first has four times the pairs
-        allowed = 30 * n + 32 * side * side + 10 * constants["BLOCK"] + 150 * constants["GROUP"]
+        allowed = 30 * n + 32 * side * side + 10 * SMALL_BLOCKS["BLOCK"] + 150 * SMALL_BLOCKS["GROUP"]
         assert peaks(n, side) < allowed
         assert by_default > 4 * allowed                                               # the measure does see the working memory
 

@@ -156,7 +156,8 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
     if group is not None:
         same = {"camera.width": width, "camera.height": height, f"camera.model (of {', '.join(MODELS)})": MODELS.index(camera.model),
                 "camera.near": camera.near, "camera.far": camera.far, "eps2d": eps2d, "antialiased": antialiased,
-                "channels of colors": colors.shape[-1], "absgrad (1: given)": absgrad is not None}
+                "channels of colors": colors.shape[-1], "sh_degree (-1: None)": -1 if sh_degree is None else sh_degree,
+                "absgrad (1: given)": absgrad is not None}
         inputs = means, quats, scales, covars, opacities, colors, screen_offset, absgrad
         viewmats, Ks = distributed.gather_cameras(viewmats, Ks, group, same, inputs)
     settings = width, height, camera.model, camera.near, camera.far, eps2d, antialiased

@@ -68,7 +68,7 @@ def measure(name: str, description: str | None, config: FitConfig, parts: tuple[
             wall, cpu = time.perf_counter() - wall - curve.wall, time.process_time() - cpu - curve.cpu
             assert result.mean is not None
             fits.append({"seed": seed, **result.mean._asdict(), "splats": len(result.gaussians), "steps": chosen.steps, "wall_s": wall, "cpu_s": cpu,
-                         "splats_per_s": curve.drawn / (result.seconds - curve.wall), "curve": curve.points})
+                         "steps_s": (taken := result.seconds - curve.wall), "splats_per_s": curve.drawn / taken, "curve": curve.points})
             print(f"{name} seed {seed}: PSNR {result.mean.psnr:.2f} dB, SSIM {result.mean.ssim:.4f}, {len(result.gaussians)} splats, "
                   f"{chosen.steps} steps, {wall:.1f} s wall, {cpu:.1f} s CPU, {torch.get_num_threads()} threads, "
                   f"{fits[-1]['splats_per_s']:,.0f} splats/s"

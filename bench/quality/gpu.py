@@ -6,7 +6,8 @@
 It runs the scripts beside it, each in a process of its own, with `--device cuda`: photos at full resolution, 7,000 and 30,000 steps, one seed, and
 the held-out photos scored at several parts of each fit, which does not count. What starts with few splats on a CPU gets more here (`SPLATS`). The
 trainer is the same with both rasterisers. A fit of some steps goes before, so that compiling is not measured. A fit that fails is a line that says
-why. **Time to quality** is when a fit comes within 0.5 dB of the poorer end of the two, linear between scores.
+why. **Time to quality** is when a fit comes within 0.5 dB of the poorer end of the two, linear between scores; reading
+photos and the last scoring do not count.
 """
 
 from __future__ import annotations
@@ -71,13 +72,13 @@ def measure_all(captures: list[str], lengths: list[int], rasterizers: list[str])
 
 def reached(fit: Report, wanted: float) -> float:
     """Seconds until the score was `wanted` dB, or until the end."""
-    points = [*fit["curve"], (fit["wall_s"], fit["psnr"])]
+    points = [*fit["curve"], (fit["steps_s"], fit["psnr"])]
     if points[0][1] >= wanted:
         return float(points[0][0])
     for (before, low), (after, high) in pairwise(points):
         if high >= wanted > low:
             return float(before + (after - before) * (wanted - low) / (high - low))
-    return float(fit["wall_s"])
+    return float(fit["steps_s"])
 
 
 def row(report: Report) -> str:

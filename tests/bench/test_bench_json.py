@@ -67,7 +67,8 @@ def fit(command, **_):
     if command[1].endswith("chair.py"):
         return gpu.subprocess.CompletedProcess(command, 1, "", "Traceback\\nRuntimeError: no more memory\\n")
     scores = [(10.0, 20.0), (30.0, 28.0)] if name == "tsplat" else [(20.0, 20.0), (60.0, 30.0)]
-    one = dict(psnr=31.0, ssim=0.9, splats=5, steps=int(value("--steps")), wall_s=90.0, cpu_s=1.0, splats_per_s=2e6, seed=0, curve=scores)
+    one = dict(psnr=31.0, ssim=0.9, splats=5, steps=int(value("--steps")), wall_s=99.0, steps_s=90.0, cpu_s=1.0, splats_per_s=2e6, seed=0,
+               curve=scores)
     report = dict(rasterizer=name, capture="fox", config=dict(), fits=[one], profile="of 3 ms on the GPU a step: blending 50 %")
     return gpu.subprocess.CompletedProcess(command, 0, gpu.json.dumps(report), "")
 gpu.subprocess.run = fit
@@ -89,7 +90,7 @@ def test_all_fits_on_a_gpu() -> None:
     assert ours["to_quality"] == {"psnr": 30.5, "s": 30 + 60 * 2.5 / 3}
     assert theirs["to_quality"] == {"psnr": 30.5, "s": 60 + 30 * 0.5}
     assert [run["error"] for run in failed] == ["RuntimeError: no more memory"] * 2
-    assert "| fox | 7,000 | gsplat | 31.00 | 0.9000 | 5 | 90 | 2e+06 | 75 (30.5 dB) |" in done.stderr
+    assert "| fox | 7,000 | gsplat | 31.00 | 0.9000 | 5 | 99 | 2e+06 | 75 (30.5 dB) |" in done.stderr
 
 
 def test_streamed_photos(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -99,7 +100,8 @@ def test_streamed_photos(monkeypatch: pytest.MonkeyPatch) -> None:
     report = photos.measure_all([2, 6], (64, 48))
     assert [row["streamed"] for row in report["rows"]] == [2, 6]
     assert report["all_MiB"] == 6 * 64 * 48 * 3 / 2**20
-    assert 0 < report["before_MiB"] <= report["rows"][0]["peak_MiB"] <= report["rows"][1]["peak_MiB"]
+    assert report["before_MiB"] > 0
+    assert all(row["photos_per_cpu_s"] > 0 for row in report["rows"])
 
 
 def test_offload_moves_what_the_formula_says() -> None:

@@ -36,6 +36,8 @@ def check_differences_between_ranks_are_errors_on_all(ranks: Ranks) -> None:
     differ(f"antialiased: {end} 0 on rank 0 and 1 on LAST", antialiased=odd)
     differ(f"eps2d: {end} 0.3 on rank 0 and 0.1 on LAST", eps2d=0.1 if odd else 0.3)
     differ(f"channels of colors: {end} 3 on rank 0 and 2 on LAST", arguments=base | {"colors": base["colors"][:, :2 if odd else 3]})
+    differ(f"sh_degree (-1: None): {end} -1 on rank 0 and 1 on LAST", arguments=base | ({"colors": scenes.sh_coefficients(10, 1)} if odd else {}),
+           sh_degree=1 if odd else None)
     differ(f"absgrad (1: given): {end} 0 on rank 0 and 1 on LAST",
            absgrad=torch.zeros(2 * ranks.count, 10, 2, dtype=torch.float64) if odd else None)
     differ(f"requires_grad of the splats (1: yes, 0: no or no_grad): {end} 0 on rank 0 and 1 on LAST",

@@ -17,7 +17,7 @@ from ranks import Ranks, expect
 from torch import Tensor
 
 import tsplat.fit.trainer
-from tsplat.fit import FitConfig, Step, fit
+from tsplat.fit import FitConfig, Step, evaluate, fit
 from tsplat.fit.checkpoint import read_checkpoint, restore, save_checkpoint
 from tsplat.fit.density import Budget, Schedule
 from tsplat.fit.losses import photo_loss, scene_regulariser, target_of
@@ -246,6 +246,9 @@ def check_a_fit_ends_the_same_after_an_interruption(ranks: Ranks) -> None:
     assert list(straight.qualities) == [capture.names[i] for i in capture.test]
     if ranks.rank == 0:
         assert len(straight.gaussians) == 333
+        alone = evaluate(straight.gaussians, capture, capture.test, config)                # 2 photos, of 2 or 3 ranks
+        for name, quality in alone.items():
+            assert straight.qualities[name] == pytest.approx(quality, rel=1e-5)             # float32, sums in another order
         assert (out / "stopped" / "scene.ply").read_bytes() == (out / "straight" / "scene.ply").read_bytes()
         names = {"checkpoint.pt", "config.json", "contact.png", "curves.png", "metrics.json", "scene.ply", "test"}
         assert {path.name for path in (out / "stopped").iterdir()} - names in ({"checkpoint.pt.0"}, {"checkpoint.pt.1"})

@@ -42,7 +42,7 @@ def check_ranks_with_nothing_visible(ranks: Ranks) -> None:
 
 
 def check_what_travels(ranks: Ranks) -> None:
-    """Of each visible splat 7 numbers and its colour, there and back; no SH coefficients, and the depth only once."""
+    """Of each visible splat 7 numbers and its colour, there and back; no SH coefficients, and the depth only once; with absgrad 2 more."""
     class Widths(TorchDispatchMode):
         def __torch_dispatch__(self, function: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
             if "all_to_all_single" in function.name() and args[0].dtype == torch.float64 and args[0].ndim == 2:
@@ -51,11 +51,12 @@ def check_what_travels(ranks: Ranks) -> None:
 
     arguments = scenes.splats(10)._asdict() | {"colors": scenes.sh_coefficients(10, 3)}
     inputs = leaves(*arguments.values())
-    widths: list[int] = []
-    with Widths():
-        rasterize(**dict(zip(arguments, inputs, strict=True)), camera=scenes.camera(), sh_degree=3, depth="expected",
-                  group=ranks.group).image.sum().backward()
-    assert widths[1:] == [10, 10], widths                       # the first: what the ranks compare
+    for absgrad, width in ((None, 10), (torch.zeros(ranks.count, 10, 2, dtype=torch.float64, requires_grad=True), 12)):
+        widths: list[int] = []
+        with Widths():
+            rasterize(**dict(zip(arguments, inputs, strict=True)), camera=scenes.camera(), sh_degree=3, depth="expected", absgrad=absgrad,
+                      group=ranks.group).image.sum().backward()
+        assert widths[1:] == [width, width], widths             # the first: what the ranks compare
 
 
 def check_what_is_recorded(ranks: Ranks) -> None:

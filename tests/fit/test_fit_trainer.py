@@ -15,6 +15,7 @@ import tsplat.fit.trainer
 from tsplat.fit import FitConfig, Step, fit
 from tsplat.fit.losses import SSIM_NAME
 from tsplat.fit.output import read_config
+from tsplat.fit.trainer import start, train_step
 from tsplat.scene import Capture, Gaussians, load_capture, read_image, write_image, write_synthetic_capture
 
 Make = Callable[..., FitConfig]
@@ -170,6 +171,25 @@ def test_gradient_that_is_not_finite(capture: Capture, config: Make) -> None:
 
     with pytest.raises(FloatingPointError, match=r"step 4, photo view_00\d\.png: the gradient of log_scales is not finite"):
         fit(capture, config(), progress=False, callbacks=[spoil])
+
+
+def test_photo_that_cannot_be_read_takes_no_turn(capture: Capture, config: Make) -> None:
+    """The same photo, and the same random background, are next."""
+    class Broken:
+        def __getitem__(self, view: int) -> torch.Tensor:
+            raise OSError("view_001.png: no such file")
+
+        def prepare(self, view: int) -> None: ...
+
+    c = config(background="random")
+    state = start(capture, c, torch.device("cpu"))
+    for _ in range(3):
+        before = list(state.queue), state.generator.get_state(), state.step
+        with pytest.raises(OSError, match="no such file"):
+            train_step(state, capture, c, Broken())             # type: ignore[arg-type]
+        assert (state.queue, state.step) == (before[0], before[2])
+        assert torch.equal(state.generator.get_state(), before[1])
+        train_step(state, capture, c)
 
 
 def test_interrupt_saves_and_says_how_to_go_on(capture: Capture, config: Make, tmp_path: Path) -> None:

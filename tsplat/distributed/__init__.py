@@ -7,7 +7,8 @@ Training"). A call does, on every rank:
    gather the cameras (25 numbers each);
 2. choose the own splats that each camera of all ranks may see, project these into it, and evaluate the colours of those that it does see (SH
    coefficients never travel);
-3. tell each rank how many splats it will get (one int64 per camera), and send the visible ones, 7 + D numbers each for D channels;
+3. tell each rank how many splats it will get (one int64 per camera), and send the visible ones, 7 + D numbers each for D channels, and
+   2 more with `absgrad`, which backward fills;
 4. bin and blend what came, for the own cameras.
 
 Backward goes the same way back: gradients of splats, `screen_offset` and `absgrad` end on the rank that owns the splat, gradients of

@@ -169,7 +169,9 @@ def start(capture: Capture, config: FitConfig, device: torch.device, ranks: Rank
 
 
 def train_step(state: FitState, capture: Capture, config: FitConfig, images: PhotoStream | None = None) -> Step:
-    """Render one photo's view (on each rank), compare, and move the parameters. Nothing changes if it raises.
+    """Render one photo's view (on each rank), compare, and move the parameters.
+
+    Nothing has changed where it raises before they move: a photo that cannot be read, numbers that are not finite, too little memory.
 
     Args:
         state: of the fit.
@@ -182,7 +184,7 @@ def train_step(state: FitState, capture: Capture, config: FitConfig, images: Pho
     before = state.generator.get_state(), list(state.queue)
     try:
         return _step(state, capture, config, images)
-    except (FloatingPointError, MemoryError):
+    except Exception:
         state.generator.set_state(before[0])
         state.queue = before[1]
         raise

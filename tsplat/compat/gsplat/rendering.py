@@ -142,7 +142,7 @@ def rasterization(means: Tensor, quats: Tensor | None, scales: Tensor | None, op
             "width": width, "height": height, f"camera_model (of {', '.join(MODELS)})": list(MODELS.values()).index(core_model(camera_model)),
             "near_plane": near_plane, "far_plane": far_plane, "radius_clip": radius_clip, "eps2d": eps2d,
             f"render_mode (of {', '.join(RENDER_MODES)})": RENDER_MODES.index(render_mode), "antialiased": antialiased, "absgrad": absgrad,
-            "channels of colors": colors.shape[-1]})
+            "channels of colors": colors.shape[-1], "sh_degree (-1: None)": -1 if sh_degree is None else sh_degree})
         C = len(viewmats)                               # of all ranks; Gaussians are those of this one
 
     radii, means2d, depths, conics, compensations = fully_fused_projection(

@@ -314,7 +314,7 @@ def test_float32_stays_within_its_rounding_errors(tile: int) -> None:
     ids, offsets = lists(s64, 40, 32, tile)
     eps = torch.finfo(torch.float32).eps
     owner = torch.repeat_interleave(offsets.diff())
-    record = footprint.records(s64.means2d[0], s64.conics[0], s64.opacities[0])[:, ids.long()][:, None]
+    record = footprint.records(s64.means2d[0], s64.conics[0], s64.opacities[0]).detach()[ids.long()].T[:, None]
     tiles_x = reference.tile_counts(40, 32, tile)[0]
     centre = [((v * tile + tile / 2) - m)[None] for v, m in ((owner % tiles_x, record[0, 0]), (owner // tiles_x, record[1, 0]))]
     coefficients, monomials = footprint.coefficients(record, *centre)[0].T, footprint.monomials(tile, torch.float64, ids.device)

@@ -44,34 +44,35 @@ def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor
     n, tiles = max(means2d.shape[1], 1), len(means2d) * tiles_x * tiles_y
     visible = (radii > 0).all(-1).flatten().nonzero().squeeze(-1)                           # [V]
     visible = visible[_sortable(depths.flatten()[visible]).sort(stable=True).indices]       # front to back
-    mx, my = means2d.reshape(-1, 2)[visible].unbind(-1)
-    a, b, c = conics.reshape(-1, 3)[visible].unbind(-1)
+    mx, my = means2d.reshape(-1, 2).index_select(0, visible).unbind(-1)
+    a, b, c = conics.reshape(-1, 3).index_select(0, visible).unbind(-1)
     a, c, eps = a.clamp_min(FLATTEST), c.clamp_min(FLATTEST), torch.finfo(a.dtype).eps
     s = b / a
     w = (c * (1 - BIN_ROUNDING * eps) - b * s).clamp_min(FLATTEST)                          # a (dx + s dy)^2 + w dy^2: w must not be too large
-    distance = (2 * torch.log(opacities.flatten()[visible].clamp_min(ALPHA_MIN) / ALPHA_MIN)).sqrt()
+    distance = (2 * torch.log(opacities.flatten().index_select(0, visible).clamp_min(ALPHA_MIN) / ALPHA_MIN)).sqrt()
     distance = distance + 2 * BIN_ROUNDING * eps * (mx.abs() + my.abs() + (width + height)) * (a + c).sqrt()
     level = distance * distance * (1 + BIN_SLACK_RELATIVE) + BIN_SLACK
 
     half_height = (level / w).sqrt()
     rightmost = -s * (a / c).sqrt() * half_height                                           # dy of the ellipse's rightmost point
-    row, last_row = _span(my - half_height, my + half_height, height, tile)
-    strip, row = _enumerate(row, last_row)                                                  # [R] splat and tile row of each strip
+    first, count = _span(my - half_height, my + half_height, height, tile)
+    strip = torch.repeat_interleave(count)                                                  # [R] the splat of each tile row of each splat
+    row = _numbers(first, count, strip)
     mx, my, s, reach, shrink, half_height, rightmost = (
         v.index_select(0, strip) for v in (mx, my, s, level / a, w / a, half_height, rightmost))
-    low = torch.maximum(row * tile + 0.5 - my, -half_height)                                # the strip's pixel centres, about the mean
-    high = torch.minimum(((row + 1) * tile).clamp_max(height) - 0.5 - my, half_height)
+    top = (row * tile).to(my.dtype)
+    low = torch.maximum(top + 0.5 - my, -half_height)                                       # the strip's pixel centres, about the mean
+    high = torch.minimum((top + tile).clamp_max(height) - 0.5 - my, half_height)
     x_high = _edge(torch.minimum(torch.maximum(rightmost, low), high), s, reach, shrink, 1.0)
     x_low = _edge(torch.minimum(torch.maximum(-rightmost, low), high), s, reach, shrink, -1.0)
-    column, last_column = _span(mx + x_low, mx + x_high, width, tile)
+    first, count = _span(mx + x_low, mx + x_high, width, tile)
 
-    hit, column = _enumerate(column, last_column)                                           # [M] strip and tile column of each hit
     splat = visible.index_select(0, strip)                                                  # [R]
-    first_tile = (splat // n * tiles_y + row) * tiles_x
-    key = first_tile.index_select(0, hit).add_(column)
+    hit = torch.repeat_interleave(count)                                                    # [M] the strip of each hit
+    key = _numbers((splat // n * tiles_y + row) * tiles_x + first, count, hit)              # its tile
     key, order = key.to(_narrowest(tiles)).sort(stable=True)
     offsets = torch.searchsorted(key, torch.arange(tiles + 1, device=key.device, dtype=key.dtype))
-    return Bins(splat.to(torch.int32).index_select(0, hit.index_select(0, order)), offsets)
+    return Bins(splat.to(torch.int32).index_select(0, hit).index_select(0, order), offsets)
 
 
 def _edge(dy: Tensor, s: Tensor, reach: Tensor, shrink: Tensor, side: float) -> Tensor:
@@ -80,18 +81,16 @@ def _edge(dy: Tensor, s: Tensor, reach: Tensor, shrink: Tensor, side: float) -> 
 
 
 def _span(low: Tensor, high: Tensor, size: int, tile: int) -> tuple[Tensor, Tensor]:
-    """First and last tile whose pixel centres (at + 0.5) lie in [low, high]; last < first if there is none."""
-    first = (low - 0.5).ceil().clamp(0, size).long()
-    last = (high - 0.5).floor().clamp(-1, size - 1).long()
-    return first // tile, torch.where(last < first, first // tile - 1, last // tile)
+    """First tile whose pixel centres (at + 0.5) lie in [low, high], and how many."""
+    first = (low - 0.5).ceil_().clamp_(0, size)
+    last = (high - 0.5).floor_().clamp_(-1, size - 1)
+    first_tile, last_tile = ((v / tile).floor_() for v in (first, last))                    # exact: sizes are far below 2^24
+    return first_tile.long(), (last_tile - first_tile + 1).mul_(last >= first).long()
 
 
-def _enumerate(first: Tensor, last: Tensor) -> tuple[Tensor, Tensor]:
-    """All integers of the ranges first..last (inclusive): which range each comes from, and the integer."""
-    count = last - first + 1
-    owner = torch.repeat_interleave(count)
-    start = count.cumsum(0) - count
-    return owner, (first - start).index_select(0, owner).add_(torch.arange(len(owner), device=count.device))
+def _numbers(first: Tensor, count: Tensor, owner: Tensor) -> Tensor:
+    """The integers of ranges, one range after the other: first, first + 1, .. first + count - 1; `owner` says which range each is of."""
+    return (first - count.cumsum(0) + count).index_select(0, owner).add_(torch.arange(len(owner), device=owner.device))
 
 
 def _sortable(depths: Tensor) -> Tensor:

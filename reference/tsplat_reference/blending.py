@@ -63,10 +63,11 @@ def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ba
 
 
 def to_image(tiles: Tensor, shape: tuple[int, int, int], width: int, height: int) -> Tensor:
-    """Tiles `[C tiles_y tiles_x, D, P]` to images `[C, H, W, D]`."""
+    """Tiles `[C tiles_y tiles_x, D, P]` to images `[C, H, W, D]`, contiguous and in memory of their own."""
     side = round(tiles.shape[-1] ** 0.5)
     tiles = tiles.view(*shape, -1, side, side).permute(0, 1, 4, 2, 5, 3)                    # C, ty, y, tx, x, D
-    return tiles.reshape(shape[0], shape[1] * side, shape[2] * side, -1)[:, :height, :width]
+    image = tiles.clone(memory_format=torch.contiguous_format).view(shape[0], shape[1] * side, shape[2] * side, -1)
+    return image[:, :height, :width].contiguous()
 
 
 def to_tiles(image: Tensor, tile: int) -> Tensor:

@@ -33,9 +33,9 @@ class _Scene:
     """The splats of all tiles, and what blending needs to know of them."""
 
     lists: TileLists
-    records: Tensor         # [6, C N]
-    colors: Tensor          # [C N or N, D + 1]; the last channel is 1, for alpha
-    shared: int             # N if all cameras share the colours, else 0
+    records: Tensor         # [C N, 9], and the colours [C N, D + 1] unless they are shared; the last channel is 1, for alpha
+    colors: Tensor | None   # [N, D + 1] if all of several cameras share them
+    channels: int           # D + 1
     alpha_max: float
     drop_last: bool
     monomials: Tensor       # [6, P]
@@ -46,27 +46,28 @@ class _Scene:
 
         `light` `[tiles, P]`, the transmittance, is what `function` updates at the tiles of its group: tiles without any are done.
         """
-        return self.lists.run(lambda chunk: function(self.group(chunk)), lambda tiles, begin: _lit(light.index_select(0, tiles)),
-                              self.colors.shape[1])
+        return self.lists.run(lambda chunk: function(self.group(chunk)), lambda tiles, begin: _lit(light.index_select(0, tiles)), self.channels)
 
     def group(self, chunk: Chunk) -> _Group:
         """Records and colours of the splats of a chunk."""
-        record = self.records.index_select(1, chunk.splats).view(6, *chunk.padding.shape)
+        shape = chunk.padding.shape
+        record = self.records.index_select(0, chunk.splats)                                 # a splat's numbers are beside each other in memory
+        if self.colors is None:
+            record, colors = record[:, :9], record[:, 9:]
+        else:
+            colors = self.colors.index_select(0, chunk.splats % len(self.colors))
+        record = record.T.contiguous().view(9, *shape)
         record[5].masked_fill_(chunk.padding, footprint.NOTHING)
         cx, cy = self.lists.centers(chunk.tiles, record.dtype)
-        rows = chunk.splats % self.shared if self.shared else chunk.splats
-        colors = self.colors.index_select(0, rows)
-        return _Group(chunk.tiles, chunk.splats, rows, record, cx[:, None] - record[0], cy[:, None] - record[1],
-                      colors.view(*chunk.padding.shape, -1), bool(record[5].amax() >= math.log(self.alpha_max)))
+        return _Group(chunk, record, cx[:, None] - record[0], cy[:, None] - record[1], colors.unflatten(0, shape),
+                      bool(record[5].amax() >= math.log(self.alpha_max)))
 
 
 class _Group(NamedTuple):
     """G tiles with K splats each."""
 
-    tiles: Tensor           # [G]
-    splats: Tensor          # [G K]
-    rows: Tensor            # [G K], of the colours
-    record: Tensor          # [6, G, K]
+    chunk: Chunk
+    record: Tensor          # [9, G, K]
     qx: Tensor              # [G, K], tile centre minus mean
     qy: Tensor
     colors: Tensor          # [G, K, D + 1]
@@ -79,9 +80,11 @@ def _scene(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, i
     tiles_x, tiles_y = tile_counts(width, height, tile)
     records = footprint.records(means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten())
     table = torch.nn.functional.pad(colors.reshape(-1, colors.shape[-1]), (0, 1), value=1.0)   # here, not for each hit
+    shared = len(colors) < C
     monomials = footprint.monomials(tile, means2d.dtype, means2d.device)
-    return _Scene(TileLists(ids, offsets[:-1], offsets.diff(), (C, tiles_y, tiles_x), tile), records, table, N if len(colors) < C else 0,
-                  alpha_max, drop_last, monomials, monomials.T / math.log(2))
+    return _Scene(TileLists(ids, offsets[:-1], offsets.diff(), (C, tiles_y, tiles_x), tile),
+                  records if shared else torch.cat([records, table], 1), table if shared else None, table.shape[1], alpha_max, drop_last,
+                  monomials, monomials.T / math.log(2))
 
 
 def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, odds: Tensor, weight: Tensor, T: Tensor) -> None:
@@ -98,13 +101,15 @@ def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, od
     torch.div(alpha, weight, out=odds)
     weight[..., 0].mul_(light)
     torch.cumprod(weight, -1, out=T)
-    if scene.drop_last:
-        _keep_where(T, odds)
-    else:
-        _keep_where(T[..., :-1], odds[..., 1:])             # T in front of the others
-        _keep_where(light, odds[..., 0])
+    behind = T[..., -1].contiguous()
+    if behind.amin() <= TRANSMITTANCE_MIN:                  # else no pixel ends here
+        if scene.drop_last:
+            _keep_where(T, odds)
+        else:
+            _keep_where(T[..., :-1], odds[..., 1:])         # T in front of the others
+            _keep_where(light, odds[..., 0])
     torch.mul(odds, T, out=weight)
-    light.copy_(T[..., -1])
+    light.copy_(behind)
 
 
 def _keep_where(T: Tensor, x: Tensor) -> None:
@@ -124,20 +129,19 @@ def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Ten
 
     def blend_group(group: _Group) -> _Group:
         coefficients = footprint.coefficients(group.record, group.qx, group.qy)
-        group_light = light.index_select(0, group.tiles)
-        group_image = image.new_empty(len(group.tiles), D + 1, tile * tile)
-        for part, (odds, weight, T) in memory.blocks(*group.qx.shape):
-            _weights(scene, coefficients[part], group.clamps, group_light[part], odds, weight, T)
-            torch.bmm(group.colors[part].mT, weight.mT, out=group_image[part])
-        light.index_copy_(0, group.tiles, group_light)                                      # no other group has these tiles
-        image.index_add_(0, group.tiles, group_image)
+        group_light = light.index_select(0, group.chunk.tiles)
+        group_image = image.new_empty(len(group.chunk.tiles), D + 1, tile * tile)
+        for rows, k, (odds, weight, T) in memory.blocks(group.chunk):
+            _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], odds, weight, T)
+            torch.bmm(group.colors[rows, :k].mT, weight.mT, out=group_image[rows])
+        light.index_copy_(0, group.chunk.tiles, group_light)                                      # no other group has these tiles
+        image.index_add_(0, group.chunk.tiles, group_image)
         return group
 
     for _ in scene.run(blend_group, light):
         pass
-    full = to_image(image, scene.lists.shape, width, height)
-    # clones, as an op's results must not share memory, which views of size 1 would
-    rendered, alphas = (x.clone(memory_format=torch.contiguous_format) for x in (full[..., :D], full[..., D]))
+    rendered, alphas = (to_image(channels, scene.lists.shape, width, height) for channels in (image[:, :D], image[:, D:]))
+    alphas = alphas[..., 0]
     if backgrounds is not None:
         rendered.addcmul_((1 - alphas)[..., None], backgrounds[:, None, None])
     return rendered, alphas
@@ -162,43 +166,50 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
         behind = torch.zeros_like(v_alphas)
     else:
         behind = torch.einsum("chwd,cd->chw", v_image, backgrounds)                         # <background, dL/dimage>
-    upstream = to_tiles(torch.cat([v_image, (v_alphas - behind)[..., None]], -1), tile)     # [tiles, D + 1, P]
-    rest = to_tiles(((image * v_image).sum(-1) + alphas * v_alphas - behind)[..., None], tile)[:, 0]
+    upstream = torch.cat([to_tiles(v_image, tile), to_tiles((v_alphas - behind)[..., None], tile)], 1)      # [tiles, D + 1, P]
+    rest = (image * v_image) @ image.new_ones(D) + alphas * v_alphas - behind               # a sum over the last axis takes 4 times as long
+    rest = to_tiles(rest[..., None], tile)[:, 0]
     light = _light(scene, width, height)
-    v_records, v_colors = torch.zeros_like(scene.records), colors.new_zeros(D, len(scene.colors))
-    v_abs = means2d.new_zeros(2, C * N if absgrad else 0)
+    shared = scene.colors is not None
+    sums = colors.new_zeros(C * N, 6 if shared else 6 + D)
+    v_colors = colors.new_zeros(N, D) if shared else sums[:, 6:]
+    v_abs = means2d.new_zeros(C * N if absgrad else 0, 2)
     highest = float(scene.records.new_tensor(alpha_max).div_(1 - scene.records.new_tensor(alpha_max)))     # rounded as odds are
     memory = Memory(scene.records, tile * tile, D + 1, 4)
 
-    def backward_group(group: _Group) -> tuple[_Group, Tensor, Tensor, list[Tensor]]:
+    def backward_group(group: _Group) -> tuple[Tensor, Tensor, list[Tensor]]:
         coefficients = footprint.coefficients(group.record, group.qx, group.qy)
-        slopes = footprint.mean_slopes(group.record, group.qx, group.qy) if absgrad else ()
-        group_light, group_rest, group_upstream = (v.index_select(0, group.tiles) for v in (light, rest, upstream))
-        moments, v_color = (colors.new_empty(len(group.tiles), n, group.qx.shape[1]) for n in (6, D))
-        sums = [torch.empty_like(group.qx) for _ in slopes]
-        for part, (odds, weight, T, v) in memory.blocks(*group.qx.shape):
-            _weights(scene, coefficients[part], group.clamps, group_light[part], odds, weight, T)
-            torch.bmm(group_upstream[part].mT, group.colors[part].mT, out=v)                # g
-            torch.bmm(group_upstream[part, :D], weight, out=v_color[part])
-            _log_alpha_gradient(v, odds, weight, T, group_rest[part])
+        slopes = footprint.mean_slopes(coefficients) if absgrad else ()
+        group_light, group_rest, group_upstream = (v.index_select(0, group.chunk.tiles) for v in (light, rest, upstream))
+        shape = group.chunk.padding.shape
+        moments, results = colors.new_zeros(shape[0], 6, shape[1]), colors.new_zeros(6 + D, *shape)
+        sums_abs = [torch.zeros_like(group.qx) for _ in slopes]
+        for rows, k, (odds, weight, T, v) in memory.blocks(group.chunk):
+            _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], odds, weight, T)
+            torch.bmm(group_upstream[rows].mT, group.colors[rows, :k].mT, out=v)            # g
+            results[6:, rows, :k] = torch.bmm(group_upstream[rows], weight)[:, :D].transpose(0, 1)  # 4 rows take less time than 3
+            _log_alpha_gradient(v, odds, weight, T, group_rest[rows])
             if group.clamps:    # v = 0 where the odds are 0, as it is already, or those of alpha_max
                 torch.ops.aten.hardtanh_backward.grad_input(v, odds, 0.0, highest, grad_input=v)
-            torch.matmul(scene.monomials, v, out=moments[part])
-            for slope, sum_abs in zip(slopes, sums, strict=True):
-                torch.matmul(scene.monomials[:3].T, slope[part], out=T)
-                torch.sum(T.mul_(v).abs_(), 1, out=sum_abs[part])
-        light.index_copy_(0, group.tiles, group_light)
-        rest.index_copy_(0, group.tiles, group_rest)
-        return group, footprint.coefficients_backward(group.record, group.qx, group.qy, moments), v_color, sums
+            moments[rows, :, :k] = torch.matmul(scene.monomials, v)     # a strided `out` is slow
+            for slope, sum_abs in zip(slopes, sums_abs, strict=True):
+                torch.matmul(scene.monomials[:3].T, slope[rows, :, :k], out=T)
+                sum_abs[rows, :k] = T.mul_(v).abs_().sum(1)
+        light.index_copy_(0, group.chunk.tiles, group_light)
+        rest.index_copy_(0, group.chunk.tiles, group_rest)
+        footprint.moments_about_mean(group.record, group.qx, group.qy, moments, results[:6])
+        return group.chunk.splats, results.flatten(1), sums_abs
 
-    for group, v_record, v_color, sums in scene.run(backward_group, light):
-        v_records.index_add_(1, group.splats, v_record.flatten(1))
-        v_colors.index_add_(1, group.rows, v_color.transpose(0, 1).reshape(D, -1))
-        for axis, sum_abs in enumerate(sums):
-            v_abs[axis].index_add_(0, group.splats, sum_abs.flatten())
-    v_means2d, v_conics, v_opacities = footprint.records_backward(conics.reshape(-1, 3), opacities.flatten(), v_records)
-    return (v_means2d.view_as(means2d), v_conics.view_as(conics), v_opacities.view_as(opacities), v_colors.T.reshape(colors.shape),
-            v_abs.T.reshape(C, -1, 2))
+    for splats, results, sums_abs in scene.run(backward_group, light):
+        # where a splat's numbers are beside each other in memory, index_add takes a third of the time that it takes with planes
+        sums.T.index_add_(1, splats, results[:sums.shape[1]])
+        if shared:
+            v_colors.T.index_add_(1, splats % N, results[6:])
+        for axis, sum_abs in enumerate(sums_abs):
+            v_abs[:, axis].index_add_(0, splats, sum_abs.flatten())
+    v_means2d, v_conics, v_opacities = footprint.records_backward(scene.records, opacities.flatten(), sums[:, :6])
+    return (v_means2d.view_as(means2d), v_conics.view_as(conics), v_opacities.view_as(opacities),
+            v_colors.clone(memory_format=torch.contiguous_format).view(colors.shape), v_abs.view(C, -1, 2))
 
 
 def _log_alpha_gradient(v: Tensor, odds: Tensor, weight: Tensor, rests: Tensor, rest: Tensor) -> None:

@@ -1,7 +1,7 @@
 """The footprint of a splat: how its alpha falls off over the image. Blending knows a footprint only through these functions.
 
-The Gaussian: log alpha = log o - (a dx^2 + c dy^2)/2 - b dx dy. With h = a/2, s = b/a and w = (c - b^2/a)/2 it is
-log o - h u^2 - w dy^2, u = dx + s dy, which keeps its precision when a long thin splat is centred far from the pixel.
+The Gaussian: log alpha = log o - (a dx^2 + c dy^2)/2 - b dx dy. With s = b/a, u = dx + s dy and the second derivatives p = -a along u
+and r = b^2/a - c along y it is log o + (p u^2 + r dy^2)/2, which keeps its precision when a long thin splat is centred far from the pixel.
 Within a tile that is a polynomial in the pixel's position (x, y) about the tile's centre: six coefficients per tile and splat turn
 the evaluation at all pixels into a matrix product, and so are the sums that the backward needs.
 """
@@ -29,54 +29,56 @@ def monomials(tile: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def records(means2d: Tensor, conics: Tensor, opacities: Tensor) -> Tensor:
-    """`[6, R]`: mean x, mean y, h, s, w and log opacity of splats `[R, 2]`, `[R, 3]`, `[R]`; finite for culled ones (conic 0)."""
+    """`[R, 9]`: mean x, mean y, s, p, r and log opacity of splats `[R, 2]`, `[R, 3]`, `[R]`, and their coefficients of x^2, xy and y^2, which
+    are those of any tile; finite for culled ones (conic 0)."""
     a, b, c = conics.unbind(-1)
     s = torch.where(a > 0, b / torch.where(a > 0, a, 1.0), 0.0)
-    return torch.stack([*means2d.unbind(-1), 0.5 * a, s, (0.5 * (c - b * s)).clamp_min(0.0),
-                        torch.log(opacities.clamp_min(torch.finfo(opacities.dtype).tiny))])
+    p, r = -a, (b * s - c).clamp_max(0.0)
+    log_opacity = torch.log(opacities.clamp_min(torch.finfo(opacities.dtype).tiny))
+    return torch.stack([*means2d.unbind(-1), s, p, r, log_opacity, 0.5 * p, p * s, 0.5 * torch.addcmul(r, p * s, s)], -1)
 
 
-def records_backward(conics: Tensor, opacities: Tensor, v_records: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients with respect to means2d, conics and opacities."""
-    v_mx, v_my, v_h, v_s, v_w, v_log = v_records
-    a, b, _ = conics.unbind(-1)
-    inverse = torch.where(a > 0, 1 / torch.where(a > 0, a, 1.0), 0.0)
-    s = b * inverse
-    v_conics = torch.stack([0.5 * v_h - s * inverse * v_s + 0.5 * s * s * v_w, inverse * v_s - s * v_w, 0.5 * v_w], -1)
-    v_opacities = torch.where(opacities > 0, v_log / torch.where(opacities > 0, opacities, 1.0), 0.0)
-    return torch.stack([v_mx, v_my], -1), v_conics, v_opacities
+def records_backward(records: Tensor, opacities: Tensor, sums: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Gradients with respect to means2d, conics and opacities, from the `sums` `[R, 6]` of `moments_about_mean` over all tiles."""
+    s, p, r = records[:, 2:5].unbind(-1)
+    v, vu, vy, vuu, vuy, vyy = sums.unbind(-1)
+    along_x = -p * vu                                                                       # du/dmx = -1, du/dmy = -s, ddy/dmy = -1
+    half = -0.5 * vyy
+    v_conics = torch.stack([torch.addcmul(-0.5 * vuu, s, torch.addcmul(vuy, s, half)), s * vyy - vuy, half], -1)    # dx = u - s dy
+    v_opacities = torch.where(opacities > 0, v / torch.where(opacities > 0, opacities, 1.0), 0.0)
+    return torch.stack([along_x, s * along_x - r * vy], -1), v_conics, v_opacities
 
 
 def coefficients(record: Tensor, qx: Tensor, qy: Tensor) -> Tensor:
-    """Polynomial coefficients `[B, 6, K]` of log alpha, from records `[6, B, K]` and tile centre minus mean, `[B, K]` each."""
-    _, _, h, s, w, log_opacity = record
-    u = torch.addcmul(qx, s, qy)
-    hu, wq, hs = h * u, w * qy, h * s
-    planes = [log_opacity - hu * u - wq * qy, -2 * hu, -2 * torch.addcmul(wq, hu, s), -h, -2 * hs, -torch.addcmul(w, hs, s)]
-    return torch.stack(planes).movedim(0, 1)
+    """Polynomial coefficients `[B, 6, K]` of log alpha, from records `[9, B, K]` and tile centre minus mean, `[B, K]` each."""
+    _, _, s, p, r, log_opacity = record[:6]
+    result = record.new_empty(len(qx), 6, qx.shape[1])
+    value, along_x, along_y = result[:, :3].unbind(1)
+    u, ry = torch.addcmul(qx, s, qy), r * qy
+    torch.mul(p, u, out=along_x)
+    torch.addcmul(ry, along_x, s, out=along_y)
+    torch.addcmul(log_opacity, along_x, u, value=0.5, out=value).addcmul_(ry, qy, value=0.5)
+    result[:, 3:] = record[6:].transpose(0, 1)
+    return result
 
 
-def coefficients_backward(record: Tensor, qx: Tensor, qy: Tensor, moments: Tensor) -> Tensor:
-    """Gradients `[6, B, K]` of the records from the `moments` `[B, 6, K]`: sums of dL/dlog alpha times monomial."""
-    _, _, h, s, w, _ = record
-    m0, mx, my, mxx, mxy, myy = moments.unbind(1)
-    u = torch.addcmul(qx, s, qy)
-    uy = u * my
-    sum_u = u * m0 + mx + s * my                                     # sum of v u over the pixels, and so on
-    sum_y = qy * m0 + my
-    sum_uu = u * (u * m0 + 2 * mx) + 2 * s * (uy + mxy) + mxx + s * s * myy
-    sum_uy = qy * sum_u + uy + mxy + s * myy
-    sum_yy = qy * (qy * m0 + 2 * my) + myy
-    v_mx = 2 * h * sum_u                                             # du/dmx = -1, du/dmy = -s, du/ds = dy, ddy/dmy = -1
-    return torch.stack([v_mx, s * v_mx + 2 * w * sum_y, -sum_uu, -2 * h * sum_uy, -sum_yy, m0])
+def moments_about_mean(record: Tensor, qx: Tensor, qy: Tensor, moments: Tensor, out: Tensor) -> None:
+    """Fill in `out` `[6, B, K]`: sums over the pixels of v, v u, v dy, v u^2, v u dy and v dy^2, where v is dL/dlog alpha, from the
+    `moments` `[B, 6, K]`, its sums times the monomials."""
+    s = record[2]
+    v, vx, vy, vxx, vxy, vyy = moments.unbind(1)
+    u = torch.addcmul(qx, s, qy)                                                            # at the tile's centre; u - that = x + s y
+    out[0] = v
+    sum_x = torch.addcmul(vx, u, v)                                                         # of v (u - s y)
+    torch.addcmul(sum_x, s, vy, out=out[1])
+    torch.addcmul(vy, qy, v, out=out[2])
+    cross = torch.addcmul(vxy, u, vy)                                                       # of v (u - s y) y
+    torch.addcmul(vxx, u, sum_x.add_(vx), out=out[3]).addcmul_(s, torch.addcmul(cross, s, vyy, value=0.5), value=2)
+    torch.addcmul(cross.addcmul_(s, vyy), qy, out[1], out=out[4])
+    torch.addcmul(vyy, qy, out[2] + vy, out=out[5])
 
 
-def mean_slopes(record: Tensor, qx: Tensor, qy: Tensor) -> tuple[Tensor, Tensor]:
-    """Coefficients `[B, 3, K]` on (1, x, y) of dlog alpha/dmean, for x and for y: what the absolute gradient needs per pixel."""
-    _, _, h, s, w, _ = record
-    u = torch.addcmul(qx, s, qy)
-    along_x = torch.stack([u, torch.ones_like(u), s], 1) * (2 * h)[:, None]
-    along_y = along_x * s[:, None]
-    along_y[:, 0] += 2 * w * qy
-    along_y[:, 2] += 2 * w
-    return along_x, along_y
+def mean_slopes(coefficients: Tensor) -> tuple[Tensor, Tensor]:
+    """Coefficients `[B, 3, K]` on (1, x, y) of minus dlog alpha/dmean, for x and for y: what the absolute gradient needs per pixel."""
+    _, x, y, xx, xy, yy = coefficients.unbind(1)
+    return torch.stack([x, 2 * xx, xy], 1), torch.stack([y, xy, 2 * yy], 1)

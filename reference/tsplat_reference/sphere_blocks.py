@@ -190,12 +190,12 @@ class SphereGroup(NamedTuple):
     k1: Tensor
     beyond: bool            # whether some hit may be out of the range of depths
 
-    def part(self, rows: slice) -> SphereGroup:
-        """Some of its tiles."""
+    def part(self, rows: slice, k: int) -> SphereGroup:
+        """Some of its tiles, and their first k spheres."""
         mono2, mono1 = (m if len(m) == 1 else m[rows] for m in (self.mono2, self.mono1))
-        return self._replace(record=self.record[:, rows], features=self.features[rows], quadratic=self.quadratic[rows],
-                             linear=self.linear[rows], mono2=mono2, mono1=mono1, distance=self.distance[rows], k0=self.k0[rows],
-                             k1=self.k1[rows])
+        return self._replace(record=self.record[:, rows, :k], features=self.features[rows, :k], quadratic=self.quadratic[rows, :, :k],
+                             linear=self.linear[rows, :, :k], mono2=mono2, mono1=mono1, distance=self.distance[rows, :k],
+                             k0=self.k0[rows, :k], k1=self.k1[rows, :k])
 
 
 def fill_hits(scene: SphereScene, g: SphereGroup, s: Tensor, h: Tensor, d: Tensor, D: Tensor) -> Tensor:
@@ -257,8 +257,8 @@ def blend_sphere_blocks(centers: Tensor, radii: Tensor, opacities: Tensor, featu
     def blend(chunk: Chunk) -> Chunk:
         group = scene.group(chunk)
         was, sums, images = (v.index_select(0, chunk.tiles) for v in (peak, total, image))
-        for rows, (s, h, d, depths, e) in memory.blocks(*chunk.padding.shape):
-            g = group.part(rows)
+        for rows, k, (s, h, d, depths, e) in memory.blocks(chunk):
+            g = group.part(rows, k)
             fill_hits(scene, g, s, h, d, depths)
             torch.addcmul(g.k0[:, None], g.k1[:, None], depths, out=e)
             e.masked_fill_(d <= 0, -torch.inf)
@@ -278,10 +278,8 @@ def blend_sphere_blocks(centers: Tensor, radii: Tensor, opacities: Tensor, featu
     for _ in lists.run(blend, alive, D + 1, grow=tolerance <= 0):      # an end that does not depend on what else is rendered
         pass
     image = torch.cat([image / total[:, None], (peak + total.log2())[:, None] / LOG2_E], 1)
-    full = to_image(image, lists.shape, width, height)
-    # clones, as an op's results must not share memory, which views of size 1 would
-    color, z, logsumexp = (x.clone(memory_format=torch.contiguous_format) for x in (full[..., :D], full[..., D], full[..., -1]))
-    return SphereImages(color, z if depth else z.new_zeros(len(z), 0, width), logsumexp, used.to(torch.int32))
+    color, z, logsumexp = (to_image(x, lists.shape, width, height) for x in (image[:, :D], image[:, D:D + 1], image[:, -1:]))
+    return SphereImages(color, z[..., 0] if depth else z.new_zeros(len(z), 0, width), logsumexp[..., 0], used.to(torch.int32))
 
 
 def softmax_gradient(images: SphereImages, v_image: Tensor, v_depth: Tensor | None, v_logsumexp: Tensor | None) -> Tensor:
@@ -332,11 +330,11 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
         group = scene.group(chunk)
         G, K = chunk.padding.shape
         ups = upstream.index_select(0, chunk.tiles)
-        m2, m1, sums = centers.new_empty(G, 6, K), centers.new_empty(G, 3, K), centers.new_zeros(4, G, K)
-        v_features = centers.new_empty(G, D, K)
+        m2, m1, v_features = (centers.new_zeros(G, n, K) for n in (6, 3, D))
+        sums = centers.new_zeros(4, G, K)
         v_norm2 = centers.new_empty(G, tile * tile) if intrinsics and not scene.orthographic else None
-        for rows, (s, h, d, depths, e, v, x) in memory.blocks(G, K):
-            g, up = group.part(rows), ups[rows]
+        for rows, k, (s, h, d, depths, e, v, x) in memory.blocks(chunk):
+            g, up = group.part(rows, k), ups[rows]
             R, o = g.record[3][:, None], g.record[4][:, None]
             factor = fill_hits(scene, g, s, h, d, depths)
             torch.addcmul(g.k0[:, None], g.k1[:, None], depths, out=e)
@@ -345,20 +343,20 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
                 e.masked_fill_(depths > up[:, -1, :, None], 0.0)
             torch.mul(e, d, out=x)
             x.mul_(o)                                                                       # w
-            torch.bmm(up[:, :D], x, out=v_features[rows])
+            v_features[rows, :, :k] = torch.bmm(up[:, :D], x)
             torch.bmm(up[:, :D].mT, g.features.mT, out=v)
             if v_depth is not None:
                 v.addcmul_(depths, up[:, D + 2, :, None])
             v.add_(up[:, D, :, None]).mul_(e)                                               # (g + softmax_gradient) e
             torch.mul(v, d, out=x)
-            torch.sum(x, 1, out=sums[0, rows])
-            sums[1, rows] = torch.mul(x, depths).sum(1)
+            torch.sum(x, 1, out=sums[0, rows, :k])
+            sums[1, rows, :k] = torch.mul(x, depths).sum(1)
             v_s = (v * o).neg_()                                                            # d = 1 - s
             along = v.mul_(o * (o * scene.slope))                                                          # dL/dD over d
             if v_depth is not None:
                 along.addcmul_(e.mul_(o), up[:, D + 2, :, None])
             torch.mul(along, d, out=x)                                                      # dL/dD
-            sums[2, rows] = -torch.mul(x, h).sum(1)                                         # D = a - R h
+            sums[2, rows, :k] = -torch.mul(x, h).sum(1)                                         # D = a - R h
             # dL/dt: h = sqrt(1 - t), and d/h = h/(1 + s) loses nothing at the outline (with chord, h is larger and division safe)
             v_t = along.mul_(d).div_(h.clamp(min=least)) if scene.chord else along.mul_(h).div_(s + 1)
             v_t.mul_(0.5 * R)
@@ -368,11 +366,11 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
                 v_t.addcmul_(v_s, factor)
                 v_factor = v_s.mul_(t).mul_(factor).mul_(factor).div_(2 * g.distance[:, None])
                 x.sub_(v_factor)
-                sums[3, rows] = (v_factor.mul_(depths + R * h) / g.distance[:, None]).sum(1)
+                sums[3, rows, :k] = (v_factor.mul_(depths + R * h) / g.distance[:, None]).sum(1)
             else:
                 v_t.add_(v_s)
-            torch.matmul(g.mono2, v_t, out=m2[rows])
-            torch.matmul(g.mono1, x, out=m1[rows])
+            m2[rows, :, :k] = torch.matmul(g.mono2, v_t)
+            m1[rows, :, :k] = torch.matmul(g.mono1, x)
             if v_norm2 is not None:
                 v_norm2[rows] = -(v_t.mul_(t) + x.mul_(depths.addcmul_(h, R)).mul_(0.5)).sum(-1)
         x0, x1, v_R, v_distance = sums
@@ -387,14 +385,15 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
         v_o = x0 + o * xz / scene.gamma
         return group, torch.cat([v_geometry, v_o[None]]), v_features, -(o * o * xz).sum() / scene.gamma**2, v_K
 
-    v_records, v_table = centers.new_zeros(5, C * N), centers.new_zeros(D, len(scene.features))
+    # a sphere's numbers beside each other in memory: as planes, index_add would take three times as long
+    v_records, v_table = centers.new_zeros(C * N, 5).T, centers.new_zeros(len(scene.features), D)
     v_Ks = centers.new_zeros(C, 4)
     for group, v_record, v_features, v_g, v_K in lists.run(backward, lambda tiles, begin: None, D + 1):
         v_records.index_add_(1, group.chunk.splats, v_record.flatten(1))
-        v_table.index_add_(1, group.rows, v_features.transpose(0, 1).reshape(D, -1))
+        v_table.T.index_add_(1, group.rows, v_features.transpose(0, 1).reshape(D, -1))
         v_gamma += v_g
         v_Ks.index_add_(0, group.chunk.tiles // (lists.shape[1] * lists.shape[2]), v_K)
-    v_records = v_records.view(5, C, N)
+    v_records = v_records.unflatten(1, (C, N))
     v_radii, v_opacities = (v if len(x) == C else v.sum(0, keepdim=True) for v, x in ((v_records[3], radii), (v_records[4], opacities)))
-    return SphereGradients(v_records[:3].permute(1, 2, 0), v_radii, v_opacities, v_table.T.reshape(features.shape), v_backgrounds, v_gamma,
+    return SphereGradients(v_records[:3].permute(1, 2, 0), v_radii, v_opacities, v_table.view(features.shape), v_backgrounds, v_gamma,
                            join_intrinsics(*v_Ks.T[..., None]))

@@ -37,12 +37,12 @@ def nearest_hits(centers: Tensor, radii: Tensor, Ks: Tensor, ids: Tensor, offset
     def insert(chunk: Chunk) -> Chunk:
         group = scene.group(chunk)
         sphere = (chunk.splats % N).to(torch.int32).view(chunk.padding.shape)
-        for rows, (s, h, d, D) in memory.blocks(*chunk.padding.shape):
-            fill_hits(scene, group.part(rows), s, h, d, D)
+        for rows, k, (s, h, d, D) in memory.blocks(chunk):
+            fill_hits(scene, group.part(rows, k), s, h, d, D)
             D.masked_fill_(d <= 0, torch.inf)
             tiles = chunk.tiles[rows]
             both = torch.cat([depths[tiles], D], -1)
-            names = torch.cat([found[tiles], sphere[rows, None].expand(-1, pixels, -1)], -1)
+            names = torch.cat([found[tiles], sphere[rows, None, :k].expand(-1, pixels, -1)], -1)
             best, order = both.topk(count, largest=False)
             depths[tiles] = best
             found[tiles] = names.gather(-1, order).masked_fill_(best == torch.inf, -1)
@@ -50,7 +50,7 @@ def nearest_hits(centers: Tensor, radii: Tensor, Ks: Tensor, ids: Tensor, offset
 
     for _ in lists.run(insert, alive, count):
         pass
-    return to_image(found.mT, lists.shape, width, height).contiguous()
+    return to_image(found.mT, lists.shape, width, height)
 
 
 def hit_weights(centers: Tensor, radii: Tensor, opacities: Tensor, gamma: Tensor, Ks: Tensor, logsumexp: Tensor, hits: Tensor, model: str,

@@ -15,7 +15,9 @@ R = TypeVar("R")
 
 CHUNK = 64
 """Splats of a tile per chunk. Finished pixels end with it, so more would waste work; fewer would pay the calls more often."""
-BLOCK = 1 << 18
+LANES = 16
+"""Chunks have a multiple of this many splats: with 7 or 8, matrix products take 5 times as long per pair as with 16."""
+BLOCK = 1 << 19
 """Pairs in a block: its buffers of this size, 4 MB in float32 where there are four, are the working set of a thread. Smaller ones fit closer
 caches, but then the calls cost more than that gains (measured from 2^15 to 2^19)."""
 GROUP = 1 << 16
@@ -30,13 +32,15 @@ WORTH_WORKERS = 1 << 18
 
 
 class Chunk(NamedTuple):
-    """K splats of each of G tiles.
+    """Up to K splats of each of G tiles.
 
-    tiles: `[G]`. splats: `[G K]`, int64, as index_add is 20 times slower with int32. padding: `[G, K]`, beyond the end of a list.
+    tiles: `[G]`. splats: `[G K]`, int64, as index_add is 20 times slower with int32. lengths: how many each tile has, in descending order.
+    padding: `[G, K]`, what is beyond that.
     """
 
     tiles: Tensor
     splats: Tensor
+    lengths: list[int]
     padding: Tensor
 
 
@@ -77,10 +81,11 @@ class TileLists:
         begin = 0
         while len(tiles):
             few = min(begin, FEW // len(tiles), BLOCK // self.tile**2) if grow else 0
-            k = min(max(CHUNK, few), int(counts[0]) - begin)
+            k = min(max(CHUNK, few // LANES * LANES), _whole(int(counts[0]) - begin))
             at = (self.starts[tiles] + begin)[:, None] + torch.arange(k)                    # [G, K]
-            padding = torch.arange(begin, begin + k) >= counts[:, None]
-            yield Chunk(tiles, self.ids.index_select(0, at.clamp_(max=len(self.ids) - 1).flatten()).long(), padding)
+            lengths = (counts - begin).clamp_(max=k)
+            yield Chunk(tiles, self.ids.index_select(0, at.clamp_(max=len(self.ids) - 1).flatten()).long(), lengths.tolist(),
+                        torch.arange(k) >= lengths[:, None])
             begin += k
             left, needed = counts > begin, alive(tiles, begin)
             live = (left if needed is None else left & needed).nonzero().squeeze(-1)
@@ -95,14 +100,22 @@ class Memory:
         self.shape = buffers, max(BLOCK, pixels * CHUNK)
         self.free: list[Tensor] = []
 
-    def blocks(self, g: int, k: int) -> Iterator[tuple[slice, tuple[Tensor, ...]]]:
-        """Blocks of a group of g tiles with k splats: their rows, and the arrays, contiguous."""
+    def blocks(self, chunk: Chunk) -> Iterator[tuple[slice, int, tuple[Tensor, ...]]]:
+        """Blocks of the tiles of a chunk: their rows, how many splats of each tile are all that are not padding, and the arrays, contiguous."""
         memory = self.free.pop() if self.free else self.like.new_empty(self.shape)
-        tiles = max(1, BLOCK // (self.pixels * max(k, self.channels)))                      # many channels: they set the working set
-        for i in range(0, g, tiles):
-            b = min(tiles, g - i)
-            yield slice(i, i + b), memory[:, :b * self.pixels * k].view(-1, b, self.pixels, k).unbind(0)
+        lengths, longest = chunk.lengths, chunk.padding.shape[1]
+        i = 0
+        while i < len(lengths):
+            k = min(_whole(lengths[i]), longest)
+            b = min(max(1, BLOCK // (self.pixels * max(k, self.channels))), len(lengths) - i)   # many channels: they set the working set
+            yield slice(i, i + b), k, memory[:, :b * self.pixels * k].view(-1, b, self.pixels, k).unbind(0)
+            i += b
         self.free.append(memory)
+
+
+def _whole(count: int) -> int:
+    """The next multiple of LANES."""
+    return -(-count // LANES) * LANES
 
 
 def _next(steps: Iterator[R]) -> R | None:

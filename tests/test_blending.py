@@ -126,11 +126,10 @@ def test_lists_longer_than_a_chunk(backend: Backend, count: int, opacity: tuple[
     assert_all_three_agree(s, 10, 9, 8, backend=backend)
 
 
-@pytest.mark.parametrize(("chunk", "block", "group", "group_tiles"), [(1, 1, 1, 1), (7, 1 << 10, 64, 3), (64, 1, 1 << 15, 128),
-                                                                      (1000, 1 << 18, 1 << 15, 1)])
+@pytest.mark.parametrize(("chunk", "block", "group"), [(1, 1, 1), (7, 1 << 10, 64), (64, 1, 1 << 9), (1000, 1 << 18, 1 << 15)])
 @pytest.mark.parametrize("channels", [3, 20])
 def test_chunks_blocks_and_groups_change_nothing(monkeypatch: pytest.MonkeyPatch, channels: int, chunk: int, block: int,
-                                                 group: int, group_tiles: int) -> None:
+                                                 group: int) -> None:
     s, inputs = differentiable(scenes.splats2d(2, 25, 13, 11, channels=channels, size=(0.5, 9.0), opacity=(0.05, 1.0)))
     probe = torch.zeros_like(s.means2d).requires_grad_()
     bins = lists(s, 13, 11, 8)
@@ -140,7 +139,7 @@ def test_chunks_blocks_and_groups_change_nothing(monkeypatch: pytest.MonkeyPatch
         return [*outputs, *gradients(outputs, [*inputs, probe])]
 
     want = run()
-    for name, value in (("CHUNK", chunk), ("BLOCK", block), ("GROUP", group), ("GROUP_TILES", group_tiles), ("WORTH_WORKERS", 0)):
+    for name, value in (("CHUNK", chunk), ("BLOCK", block), ("GROUP", group), ("WORTH_WORKERS", 0)):
         monkeypatch.setattr(walk, name, value)
     with threads(1):
         got = run()

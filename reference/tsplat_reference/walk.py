@@ -18,17 +18,17 @@ CHUNK = 64
 LANES = 16
 """Chunks have a multiple of this many splats: with 7 or 8, matrix products take 5 times as long per pair as with 16."""
 BLOCK = 1 << 19
-"""Pairs in a block: its buffers of this size, 4 MB in float32 where there are four, are the working set of a thread. Smaller ones fit closer
-caches, but then the calls cost more than that gains (measured from 2^15 to 2^19)."""
+"""Pairs in a block: its buffers of this size, 8 MB in float32 where there are four, are the working set of a thread. Smaller ones fit closer
+caches, but then the calls cost more than that gains (measured from 2^15 to 2^20), the more so with several threads, which wait for each
+other in Python."""
 GROUP = 1 << 16
 """Hits of a group of blocks, whose small operations (gathering, coefficients, scattering) are done together, by one thread: about 60
 numbers per hit, 16 MB in float32. With more than 8 channels a group has fewer hits. (Half as many: 1.07 times as long at 10k splats.)"""
 FEW = 1 << 13
 """Hits of a group below which its chunks grow, up to twofold each time: the calls for a few tiles with long lists cost more than their work."""
-GROUP_TILES = 256
-"""Where there are few tiles for several threads: no smaller groups than this. (With 128, a frame of 1,024 tiles takes 1.15 times as long.)"""
-WORTH_WORKERS = 1 << 18
-"""Hits from which worker threads gain: at 70k, two threads take 1.1 times as long as one; at 700k, 0.65 times."""
+WORTH_WORKERS = 1 << 15
+"""Hits from which worker threads gain, if there are several groups: at 70k, two threads take 0.9 times as long as without workers, at 9k 1.3
+times. (With more groups and smaller ones, threads wait for each other in Python: 1.15 times as long with half as many tiles in each.)"""
 
 
 class Chunk(NamedTuple):
@@ -63,9 +63,7 @@ class TileLists:
         """
         tiles = self.counts.sort(descending=True, stable=True).indices[:int((self.counts > 0).sum())]     # longest lists first
         size = max(1, GROUP * 9 // (CHUNK * max(9, channels)))
-        worth = int(self.counts.sum()) >= WORTH_WORKERS
-        if worth:
-            size = min(size, max(GROUP_TILES, -(-len(tiles) // 8)))                         # some groups for each core
+        worth = len(tiles) > size and int(self.counts.sum()) >= WORTH_WORKERS
         strands = [map(function, self._chunks(some, alive, grow)) for some in torch.split(tiles, size)]
         with workers(worth) as ordered_map:
             yield from (result for result in ordered_map(_next, strands, repeat=True) if result is not None)

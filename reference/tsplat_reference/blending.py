@@ -66,8 +66,9 @@ def to_image(tiles: Tensor, shape: tuple[int, int, int], width: int, height: int
     """Tiles `[C tiles_y tiles_x, D, P]` to images `[C, H, W, D]`, contiguous and in memory of their own."""
     side = round(tiles.shape[-1] ** 0.5)
     tiles = tiles.view(*shape, -1, side, side).permute(0, 1, 4, 2, 5, 3)                    # C, ty, y, tx, x, D
-    image = tiles.clone(memory_format=torch.contiguous_format).view(shape[0], shape[1] * side, shape[2] * side, -1)
-    return image[:, :height, :width].contiguous()
+    # a copy whose innermost loop has 3 numbers takes 2 to 3 times as long as one per channel
+    image = torch.stack(tiles.unbind(-1), -1) if tiles.shape[-1] <= 8 else tiles.clone(memory_format=torch.contiguous_format)
+    return image.view(shape[0], shape[1] * side, shape[2] * side, -1)[:, :height, :width].contiguous()
 
 
 def to_tiles(image: Tensor, tile: int) -> Tensor:

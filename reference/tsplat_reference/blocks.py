@@ -59,7 +59,7 @@ class _Scene:
         record = record.T.contiguous().view(9, *shape)
         record[5].masked_fill_(chunk.padding, footprint.NOTHING)
         cx, cy = self.lists.centers(chunk.tiles, record.dtype)
-        return _Group(chunk, record, cx[:, None] - record[0], cy[:, None] - record[1], colors.unflatten(0, shape),
+        return _Group(chunk, record, cx[:, None] - record[0], cy[:, None] - record[1], colors.view(*shape, -1),
                       bool(record[5].amax() >= math.log(self.alpha_max)))
 
 

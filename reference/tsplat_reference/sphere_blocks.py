@@ -393,7 +393,7 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
         v_table.T.index_add_(1, group.rows, v_features.transpose(0, 1).reshape(D, -1))
         v_gamma += v_g
         v_Ks.index_add_(0, group.chunk.tiles // (lists.shape[1] * lists.shape[2]), v_K)
-    v_records = v_records.unflatten(1, (C, N))
+    v_records = v_records.view(5, C, N)
     v_radii, v_opacities = (v if len(x) == C else v.sum(0, keepdim=True) for v, x in ((v_records[3], radii), (v_records[4], opacities)))
     return SphereGradients(v_records[:3].permute(1, 2, 0), v_radii, v_opacities, v_table.view(features.shape), v_backgrounds, v_gamma,
                            join_intrinsics(*v_Ks.T[..., None]))

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import statistics
 import subprocess
 import sys
@@ -22,7 +21,7 @@ from collections.abc import Callable
 from typing import Any
 
 import torch
-from output import add_json, environment, print_json, printing
+from output import add_json, environment, peak_memory, print_json, printing
 from scenes import Scene, count_pairs, random_scene
 
 import tsplat
@@ -113,14 +112,14 @@ def growth() -> list[dict[str, float]]:
 def large() -> dict[str, float]:
     """Forward and backward of 1M splats at 1920x1080: the peak memory of a process that does nothing else."""
     n, width, height = LARGE
-    baseline = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    before = peak_memory()
     scene = random_scene(n, width, height)
     start = time.perf_counter()
     forward_backward(scene, torch.ones(height, width, 3))
-    seconds, peak = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    print(f"\n{n:,} splats at {width}x{height}, forward+backward: {seconds:.1f} s, peak memory of the process {peak / 2**20:.2f} GiB "
-          f"({baseline / 2**20:.2f} GiB of it before the first call)", flush=True)
-    return {"width": width, "height": height, "n": n, "seconds": seconds, "peak_KiB": peak, "before_KiB": baseline}
+    seconds, peak = time.perf_counter() - start, peak_memory()
+    print(f"\n{n:,} splats at {width}x{height}, forward+backward: {seconds:.1f} s, peak memory of the process {peak / 2**30:.2f} GiB "
+          f"({before / 2**30:.2f} GiB of it before the first call)", flush=True)
+    return {"width": width, "height": height, "n": n, "seconds": seconds, "peak_bytes": peak, "before_bytes": before}
 
 
 def main() -> None:

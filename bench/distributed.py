@@ -96,7 +96,7 @@ from unittest import mock
 import torch
 import torch.distributed as dist
 import torch.multiprocessing as mp
-from output import add_json, environment, print_json, printing
+from output import add_json, environment, memory, peak_memory, print_json, printing
 from scenes import random_scene
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -194,11 +194,6 @@ def work(rank: int, ranks: int, folder: str, blocks: int, splats: int, size: tup
     dist.destroy_process_group()
 
 
-def status(name: str) -> int:
-    """Bytes, from what Linux knows of this process."""
-    return next(int(line.split()[1]) * 1024 for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(name))
-
-
 def hold(rank: int, ranks: int, folder: str, splats: int) -> None:
     """The peak of memory in a step of one process, with one camera on each."""
     torch.set_num_threads(1)
@@ -208,11 +203,11 @@ def hold(rank: int, ranks: int, folder: str, splats: int) -> None:
     leaves = [v[rank::ranks].clone().requires_grad_() for v in scene]
     del scene
     for _ in range(2):
-        before = status("VmRSS")
+        before = memory("VmRSS")
         Path("/proc/self/clear_refs").write_text("5")                                       # the peak begins anew
         torch.autograd.grad(tsplat.rasterize(*leaves, camera, group=dist.group.WORLD).image.sum(), leaves)
         dist.barrier()
-    Path(folder, f"{rank}.json").write_text(json.dumps((status("VmHWM") - before) / len(leaves[0]) / ranks))
+    Path(folder, f"{rank}.json").write_text(json.dumps((peak_memory() - before) / len(leaves[0]) / ranks))
     dist.barrier()
     dist.destroy_process_group()
 

@@ -1,4 +1,4 @@
-"""Of all scripts that measure: `--json`, with which a document is all that stdout gets, and what the figures in it hold for."""
+"""Of all scripts that measure: `--json`, with which a document is all that stdout gets, what the figures in it hold for, and memory."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import contextlib
 import datetime
 import json
 import platform
+import resource
 import subprocess
 import sys
 from pathlib import Path
@@ -29,6 +30,18 @@ def environment(device: str) -> dict[str, Any]:
     command = ["python", script.relative_to(ROOT).as_posix() if script.is_relative_to(ROOT) else script.name, *sys.argv[1:]]
     return {"device": device, "machine": machine, **versions, "threads": torch.get_num_threads(), "command": " ".join(command),
             "commit": commit, "date": datetime.date.today().isoformat()}
+
+
+def memory(name: str) -> int:
+    """Bytes, from what Linux knows of this process: VmRSS is what it holds, VmHWM the most that it held."""
+    return next(int(line.split()[1]) * 1024 for line in Path("/proc/self/status").read_text().splitlines() if line.startswith(name))
+
+
+def peak_memory() -> int:
+    """Bytes: the most that this process held so far. On Linux not by getrusage, which begins with the peak of the process that started this one."""
+    if sys.platform == "linux":
+        return memory("VmHWM")
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

@@ -13,14 +13,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import tempfile
 import time
 from pathlib import Path
 from typing import Any
 
 import torch
-from output import add_json, environment, print_json, printing
+from output import add_json, environment, peak_memory, print_json, printing
 from torch import Tensor
 from torch.nn.functional import interpolate
 
@@ -83,7 +82,7 @@ def stream(capture: Capture, marks: list[int]) -> list[dict[str, Any]]:
 
 def peak_mib() -> float:
     """Of the memory of this process so far."""
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    return peak_memory() / 2**20
 
 
 def measure_all(marks: list[int], size: tuple[int, int]) -> dict[str, Any]:

@@ -19,9 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
-import resource
 import statistics
-import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -32,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from output import add_json, environment, print_json, printing
+from output import add_json, environment, peak_memory, print_json, printing
 from torch import Tensor
 
 import tsplat
@@ -145,7 +143,7 @@ def peak_bytes(device: str) -> int:
     """Of this process so far."""
     if device == "cuda":
         return torch.cuda.max_memory_allocated()
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
+    return peak_memory()
 
 
 def measure(setup: Setup, device: str, threads: int, times: int) -> dict[str, Any]:

@@ -31,6 +31,16 @@ def test_ranks_send_the_bytes_of_the_formula(tmp_path: Path) -> None:
     assert row["loopback"] > row["bytes"]
 
 
+def test_the_peak_of_memory_is_not_that_of_who_started_the_process() -> None:
+    """As getrusage's is."""
+    parent = "import subprocess, sys; held = b'x' * (700 << 20); subprocess.run([sys.executable, '-c', sys.argv[1]], check=True)"
+    child = "import output; before = output.peak_memory(); held = b'x' * (100 << 20); print(before, output.peak_memory())"
+    done = subprocess.run([sys.executable, "-c", parent, child], env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    before, after = map(int, done.stdout.split())
+    assert 80 << 20 <= after - before <= 120 << 20
+
+
 def test_rows_of_the_cpu_compare_as_many_exps() -> None:
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", ROW], env=ENVIRONMENT, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr

@@ -3,10 +3,11 @@
     python bench/cpu.py               # the table of all scenes, how time grows, and the memory of 1M splats at 1920x1080
     python bench/cpu.py --quick       # two rows
 
-Each row gives forward and forward+backward in ms (median of 9, float32; backward to means, scales, quats, colours and opacities), blended
+Each row gives forward and forward+backward in ms (median of 25, float32; backward to means, scales, quats, colours and opacities), blended
 pairs per second over `torch.exp` per second, measured in cache, in the same process and with the same threads, and the time of the best C++ rival
 (OpenSplat 2026, 2 threads) scaled by the exp rates of its machine (3.4 G/s) and of this one. How fast a shared machine is changes by half within
-seconds, so that the rate is measured right before and right after each sample, and what is compared is the median of time times rate.
+seconds, so that the rate is measured right before and right after each sample, what is compared is the median of time times rate, and samples are
+taken in rounds: five of each row, then of each row again.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import torch
@@ -49,15 +51,14 @@ def seconds(run: Callable[[], object]) -> float:
     return time.perf_counter() - start
 
 
-def samples(run: Callable[[], object], times: int) -> tuple[float, float]:
-    """Medians of the milliseconds of a call, and of as many `torch.exp` as the machine made in that time."""
+def samples(run: Callable[[], object], times: int) -> list[tuple[float, float]]:
+    """Milliseconds of a call, and as many `torch.exp` as the machine made in that time."""
     run()
-    taken, exps = [], []
+    taken = []
     for _ in range(times):
         before, duration = exp_rate(), seconds(run)
-        taken.append(1e3 * duration)
-        exps.append(duration * (before + exp_rate()) / 2)
-    return statistics.median(taken), statistics.median(exps)
+        taken.append((1e3 * duration, duration * (before + exp_rate()) / 2))
+    return taken
 
 
 def forward(scene: Scene) -> None:
@@ -71,41 +72,45 @@ def forward_backward(scene: Scene, v_image: torch.Tensor) -> None:
     torch.autograd.grad(image, leaves, v_image)
 
 
-def measure(width: int, height: int, n: int, times: int = 9) -> dict[str, float]:
-    scene = random_scene(n, width, height)
-    v_image = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(0))
-    (forward_ms, forward_exps), (both_ms, both_exps) = (samples(run, times) for run in (
-        lambda: forward(scene), lambda: forward_backward(scene, v_image)))
-    return {"width": width, "height": height, "n": n, "forward_ms": forward_ms, "both_ms": both_ms, "forward_exps": forward_exps,
-            "both_exps": both_exps}
-
-
-def table(rows: list[tuple[int, int, int]]) -> list[dict[str, float]]:
-    print("| size | splats | pairs (M) | fwd ms | fwd+bwd ms | fwd M pairs/s | fwd+bwd | fwd pairs/exp | fwd+bwd | rival's ms | ratio |")
-    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |")
+def measure(sizes: list[tuple[int, int, int]], rounds: int, times: int) -> list[dict[str, float]]:
+    """Medians of rounds over all sizes (width, height, splats), with so many samples of each."""
+    taken: list[tuple[list[tuple[float, float]], list[tuple[float, float]]]] = [([], []) for _ in sizes]
+    for _ in range(rounds):
+        for (width, height, n), (alone, both) in zip(sizes, taken, strict=True):
+            scene = random_scene(n, width, height)
+            v_image = torch.randn(height, width, 3, generator=torch.Generator().manual_seed(0))
+            alone += samples(partial(forward, scene), times)
+            both += samples(partial(forward_backward, scene, v_image), times)
     results = []
-    for width, height, n in rows:
-        row = measure(width, height, n)
+    for (width, height, n), each in zip(sizes, taken, strict=True):
+        (forward_ms, forward_exps), (both_ms, both_exps) = (map(statistics.median, zip(*some, strict=True)) for some in each)
+        results.append({"width": width, "height": height, "n": n, "forward_ms": forward_ms, "both_ms": both_ms, "forward_exps": forward_exps,
+                        "both_exps": both_exps})
+    return results
+
+
+def table(sizes: list[tuple[int, int, int]]) -> list[dict[str, float]]:
+    print("| size | splats | pairs (M) | fwd ms | fwd+bwd ms | fwd M pairs/s | fwd+bwd | fwd pairs/exp | fwd+bwd | rival's ms | ratio |")
+    print("| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |", flush=True)
+    results = measure(sizes, rounds=5, times=5)
+    for row, (width, height, n) in zip(results, sizes, strict=True):
         pairs = row["pairs"] = count_pairs(random_scene(n, width, height))
         ms, exps = (row["forward_ms"], row["both_ms"]), (row["forward_exps"], row["both_exps"])
         ratios = [ours / (1e-3 * rival * RIVAL_EXP_RATE) for ours, rival in zip(exps, RIVAL_MS[width, height, n], strict=True)]
         row["rival_ms"] = rival = [ours / ratio for ours, ratio in zip(ms, ratios, strict=True)]
         print(f"| {width}x{height} | {n:,} | {pairs / 1e6:.2f} | {ms[0]:.0f} | {ms[1]:.0f} | {pairs / ms[0] / 1e3:.0f} | {pairs / ms[1] / 1e3:.0f} | "
-              f"{pairs / exps[0]:.4f} | {pairs / exps[1]:.4f} | {rival[0]:.0f} / {rival[1]:.0f} | {ratios[0]:.2f} / {ratios[1]:.2f} |", flush=True)
-        results.append(row)
+              f"{pairs / exps[0]:.4f} | {pairs / exps[1]:.4f} | {rival[0]:.0f} / {rival[1]:.0f} | {ratios[0]:.2f} / {ratios[1]:.2f} |")
     return results
 
 
 def growth() -> list[dict[str, float]]:
     """How time grows with splats (at 512x512) and with pixels (at 100k splats)."""
-    print("\n| size | splats | fwd ms | fwd+bwd ms |\n| --- | --- | --- | --- |")
-    results = []
+    print("\n| size | splats | fwd ms | fwd+bwd ms |\n| --- | --- | --- | --- |", flush=True)
     sizes = [(512, 512, n) for n in (1_000, 10_000, 100_000, 1_000_000)] + [(w, h, 100_000) for w, h in (
         (128, 128), (256, 256), (1024, 1024), (1920, 1080), (3840, 2160))]
-    for size in sizes:
-        row = measure(*size, times=3)
-        print(f"| {size[0]}x{size[1]} | {size[2]:,} | {row['forward_ms']:.0f} | {row['both_ms']:.0f} |", flush=True)
-        results.append(row)
+    results = measure(sizes, rounds=1, times=3)
+    for row, (width, height, n) in zip(results, sizes, strict=True):
+        print(f"| {width}x{height} | {n:,} | {row['forward_ms']:.0f} | {row['both_ms']:.0f} |")
     return results
 
 

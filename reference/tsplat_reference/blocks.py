@@ -215,10 +215,8 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
 def _log_alpha_gradient(v: Tensor, odds: Tensor, weight: Tensor, rests: Tensor, rest: Tensor) -> None:
     """Turn v from g into dL/dlog alpha, in place; `rests` is room, and `rest` `[B, P]` in front of the chunk becomes that behind."""
     v.mul_(weight)
-    first = v[..., 0].clone()
-    v[..., 0].sub_(rest)
-    torch.cumsum(v, -1, out=rests)                                                          # minus the rest behind each splat
-    v[..., 0] = first
+    torch.cumsum(v, -1, out=rests)
+    rests.sub_(rest[..., None])                                                             # minus the rest behind each splat
     torch.neg(rests[..., -1], out=rest)
     v.addcmul_(odds, rests)
 

@@ -134,7 +134,7 @@ def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Ten
         for rows, k, (odds, weight, T) in memory.blocks(group.chunk):
             _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], odds, weight, T)
             torch.bmm(group.colors[rows, :k].mT, weight.mT, out=group_image[rows])
-        light.index_copy_(0, group.chunk.tiles, group_light)                                      # no other group has these tiles
+        light.index_copy_(0, group.chunk.tiles, group_light)                                # no other group has these tiles
         image.index_add_(0, group.chunk.tiles, group_image)
         return group
 

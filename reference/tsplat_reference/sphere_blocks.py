@@ -352,11 +352,11 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
             torch.sum(x, 1, out=sums[0, rows, :k])
             sums[1, rows, :k] = torch.mul(x, depths).sum(1)
             v_s = (v * o).neg_()                                                            # d = 1 - s
-            along = v.mul_(o * (o * scene.slope))                                                          # dL/dD over d
+            along = v.mul_(o * (o * scene.slope))                                           # dL/dD over d
             if v_depth is not None:
                 along.addcmul_(e.mul_(o), up[:, D + 2, :, None])
             torch.mul(along, d, out=x)                                                      # dL/dD
-            sums[2, rows, :k] = -torch.mul(x, h).sum(1)                                         # D = a - R h
+            sums[2, rows, :k] = -torch.mul(x, h).sum(1)                                     # D = a - R h
             # dL/dt: h = sqrt(1 - t), and d/h = h/(1 + s) loses nothing at the outline (with chord, h is larger and division safe)
             v_t = along.mul_(d).div_(h.clamp(min=least)) if scene.chord else along.mul_(h).div_(s + 1)
             v_t.mul_(0.5 * R)

@@ -34,6 +34,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from output import peak_memory
 
 from tsplat.scene import Gaussians
 from tsplat.scene.formats import find_format
@@ -291,7 +292,7 @@ def run(sample: Sample, index: int, files: int) -> None:
         tempfile.tempdir = folder                                 # also for what readers unpack
         path = Path(folder) / sample.name
         assert check(path, sample.data), "the valid file is refused"
-        before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+        before = peak_memory()
         pages = int(Path("/proc/self/statm").read_text().split()[0])
         resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY,) * 2)
         signal.signal(signal.SIGALRM, _too_slow)
@@ -309,7 +310,7 @@ def run(sample: Sample, index: int, files: int) -> None:
                 raise
             signal.alarm(0)
             slowest = max(slowest, time.perf_counter() - began)
-        grown = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+        grown = (peak_memory() - before) / 2**20
         print(f"| {index} {sample.name} | {len(sample.data)} | {files} | {taken} | {slowest * 1e3:.0f} | {grown:.1f} | "
               f"{time.perf_counter() - start:.0f} |", flush=True)
 

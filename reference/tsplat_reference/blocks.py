@@ -33,8 +33,8 @@ class _Scene:
     """The splats of all tiles, and what blending needs to know of them."""
 
     lists: TileLists
-    records: Tensor         # [C N, 9], and the colours [C N, D + 1] unless they are shared; the last channel is 1, for alpha
-    colors: Tensor | None   # [N, D + 1] if all of several cameras share them
+    records: Tensor         # [C N, RECORD], and the colours [C N, D + 1] unless they are shared; the last channel is 1, for alpha
+    colors: Tensor | None   # [N, D + 1] if several cameras share them
     channels: int           # D + 1
     alpha_max: float
     drop_last: bool
@@ -53,10 +53,10 @@ class _Scene:
         shape = chunk.padding.shape
         record = self.records.index_select(0, chunk.splats)                                 # a splat's numbers are beside each other in memory
         if self.colors is None:
-            record, colors = record[:, :9], record[:, 9:]
+            record, colors = record[:, :footprint.RECORD], record[:, footprint.RECORD:]
         else:
             colors = self.colors.index_select(0, chunk.splats % len(self.colors))
-        record = record.T.contiguous().view(9, *shape)
+        record = record.T.contiguous().view(-1, *shape)
         record[5].masked_fill_(chunk.padding, footprint.NOTHING)
         cx, cy = self.lists.centers(chunk.tiles, record.dtype)
         return _Group(chunk, record, cx[:, None] - record[0], cy[:, None] - record[1], colors.view(*shape, -1),
@@ -67,7 +67,7 @@ class _Group(NamedTuple):
     """G tiles with K splats each."""
 
     chunk: Chunk
-    record: Tensor          # [9, G, K]
+    record: Tensor          # [RECORD, G, K]
     qx: Tensor              # [G, K], tile centre minus mean
     qy: Tensor
     colors: Tensor          # [G, K, D + 1]
@@ -76,14 +76,14 @@ class _Group(NamedTuple):
 
 def _scene(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ids: Tensor, offsets: Tensor, width: int, height: int,
            tile: int, alpha_max: float, drop_last: bool) -> _Scene:
-    C, N = opacities.shape
+    C, D = len(opacities), colors.shape[-1]
     tiles_x, tiles_y = tile_counts(width, height, tile)
     records = footprint.records(means2d.reshape(-1, 2), conics.reshape(-1, 3), opacities.flatten())
-    table = torch.nn.functional.pad(colors.reshape(-1, colors.shape[-1]), (0, 1), value=1.0)   # here, not for each hit
+    table = [colors.reshape(-1, D), colors.new_ones(colors.shape[0] * colors.shape[1], 1)]      # here, not for each hit
     shared = len(colors) < C
     monomials = footprint.monomials(tile, means2d.dtype, means2d.device)
     return _Scene(TileLists(ids, offsets[:-1], offsets.diff(), (C, tiles_y, tiles_x), tile),
-                  records if shared else torch.cat([records, table], 1), table if shared else None, table.shape[1], alpha_max, drop_last,
+                  records if shared else torch.cat([records, *table], 1), torch.cat(table, 1) if shared else None, D + 1, alpha_max, drop_last,
                   monomials, monomials.T / math.log(2))
 
 

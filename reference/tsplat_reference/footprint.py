@@ -11,6 +11,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+RECORD = 9
+"""Numbers of a record."""
+
 NOTHING = -1e4
 """The log opacity of padding: exp of it is 0 in every dtype."""
 
@@ -29,7 +32,7 @@ def monomials(tile: int, dtype: torch.dtype, device: torch.device) -> Tensor:
 
 
 def records(means2d: Tensor, conics: Tensor, opacities: Tensor) -> Tensor:
-    """`[R, 9]`: mean x, mean y, s, p, r and log opacity of splats `[R, 2]`, `[R, 3]`, `[R]`, and their coefficients of x^2, xy and y^2, which
+    """`[R, RECORD]`: mean x, mean y, s, p, r and log opacity of splats `[R, 2]`, `[R, 3]`, `[R]`, and their coefficients of x^2, xy and y^2, which
     are those of any tile; finite for culled ones (conic 0)."""
     a, b, c = conics.unbind(-1)
     s = torch.where(a > 0, b / torch.where(a > 0, a, 1.0), 0.0)
@@ -50,7 +53,7 @@ def records_backward(records: Tensor, opacities: Tensor, sums: Tensor) -> tuple[
 
 
 def coefficients(record: Tensor, qx: Tensor, qy: Tensor) -> Tensor:
-    """Polynomial coefficients `[B, 6, K]` of log alpha, from records `[9, B, K]` and tile centre minus mean, `[B, K]` each."""
+    """Polynomial coefficients `[B, 6, K]` of log alpha, from records `[RECORD, B, K]` and tile centre minus mean, `[B, K]` each."""
     _, _, s, p, r, log_opacity = record[:6]
     result = record.new_empty(len(qx), 6, qx.shape[1])
     value, along_x, along_y = result[:, :3].unbind(1)

@@ -20,7 +20,7 @@ from tsplat_reference import footprint
 from tsplat_reference.binning import tile_counts
 from tsplat_reference.blending import to_image, to_tiles
 from tsplat_reference.constants import ALPHA_MIN, TRANSMITTANCE_MIN
-from tsplat_reference.walk import Chunk, Memory, TileLists
+from tsplat_reference.walk import Chunk, Memory, TileLists, products
 
 R = TypeVar("R")
 
@@ -39,7 +39,7 @@ class _Scene:
     alpha_max: float
     drop_last: bool
     monomials: Tensor       # [6, P]
-    exponents: Tensor       # [P, 6]: these times the coefficients of log alpha are log2 alpha
+    exponents: Tensor       # [6, P]: the coefficients of log alpha times these are log2 alpha
 
     def run(self, function: Callable[[_Group], R], light: Tensor) -> Iterator[R]:
         """The results of `function` of groups of tiles, in an order that the number of threads does not change.
@@ -84,32 +84,63 @@ def _scene(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, i
     monomials = footprint.monomials(tile, means2d.dtype, means2d.device)
     return _Scene(TileLists(ids, offsets[:-1], offsets.diff(), (C, tiles_y, tiles_x), tile),
                   records if shared else torch.cat([records, *table], 1), torch.cat(table, 1) if shared else None, D + 1, alpha_max, drop_last,
-                  monomials, monomials.T / math.log(2))
+                  monomials, monomials / math.log(2))
 
 
-def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, odds: Tensor, weight: Tensor, T: Tensor) -> None:
-    """Fill in odds, alpha/(1 - alpha) or 0 beyond the end of a pixel, weight, which is odds times T, and T, the transmittance behind.
+def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, alpha: Tensor, T: Tensor, weight: Tensor, odds: bool) -> None:
+    """Fill in alpha, or with `odds` alpha/(1 - alpha), 0 beyond the end of a pixel, T, the transmittance behind, and weight, the product of alpha
+    and the transmittance in front, which may take the room of either.
 
     `light` `[B, P]` is the transmittance in front of the chunk, and behind it on return.
     """
-    alpha = torch.matmul(scene.exponents, coefficients, out=odds)
+    products(coefficients.mT, scene.exponents, out=alpha)
     torch.threshold_(alpha, LOG2_ALPHA_MIN, footprint.NOTHING)
     alpha.exp2_()
     if clamp:
         alpha.clamp_(max=scene.alpha_max)
-    torch.sub(1, alpha, out=weight)
-    torch.div(alpha, weight, out=odds)
-    weight[..., 0].mul_(light)
-    torch.cumprod(weight, -1, out=T)
-    behind = T[..., -1].contiguous()
+    torch.sub(1, alpha, out=T)
+    if odds:
+        alpha.div_(T)
+    scan(torch.mul, T, light, T)
+    behind = T[:, -1].clone()
     if behind.amin() <= TRANSMITTANCE_MIN:                  # else no pixel ends here
         if scene.drop_last:
-            _keep_where(T, odds)
+            _keep_where(T, alpha)
         else:
-            _keep_where(T[..., :-1], odds[..., 1:])         # T in front of the others
-            _keep_where(light, odds[..., 0])
-    torch.mul(odds, T, out=weight)
+            _keep_where(T[:, :-1], alpha[:, 1:])            # T in front of the others
+            _keep_where(light, alpha[:, 0])
+    if odds:
+        torch.mul(alpha, T, out=weight)
+    else:
+        torch.mul(alpha[:, 0], light, out=weight[:, 0])
+        torch.mul(alpha[:, 1:], T[:, :-1], out=weight[:, 1:])
     light.copy_(behind)
+
+
+def scan(op: Callable[..., Tensor], x: Tensor, start: Tensor, out: Tensor) -> None:
+    """Running sums or products along the second dimension: out[:, k] = start op x[:, 0] op .. op x[:, k]; `out` may be x.
+
+    Of pairs, then of pairs of pairs, and back (Brent and Kung, 1982): twice the operations of torch.cumsum and cumprod, but these take one number
+    after the other, which is 2 to 3 times as long.
+    """
+    op(x[:, 0], start, out=out[:, 0])
+    if x.shape[1] > 1:
+        op(x[:, 1], out[:, 0], out=out[:, 1])
+        op(x[:, 3::2], x[:, 2:-1:2], out=out[:, 3::2])
+        _scan_pairs(op, out[:, 1::2])
+        op(x[:, 2::2], out[:, 1:-1:2], out=out[:, 2::2])
+
+
+def _scan_pairs(op: Callable[..., Tensor], x: Tensor) -> None:
+    """In place, without a start; the last 8 one after the other, which are fewer calls."""
+    if x.shape[1] <= 8:
+        rows = x.unbind(1)
+        for before, row in zip(rows, rows[1:]):
+            op(row, before, out=row)
+    else:
+        op(x[:, 1::2], x[:, :-1:2], out=x[:, 1::2])
+        _scan_pairs(op, x[:, 1::2])
+        op(x[:, 2::2], x[:, 1:-1:2], out=x[:, 2::2])
 
 
 def _keep_where(T: Tensor, x: Tensor) -> None:
@@ -125,26 +156,26 @@ def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Ten
     D = colors.shape[-1]
     light = _light(scene, width, height)
     image = light.new_zeros(len(light), D + 1, tile * tile)
-    memory = Memory(scene.records, tile * tile, D + 1, 3)
+    memory = Memory(scene.records, tile * tile, D + 1, 2)
 
     def blend_group(group: _Group) -> _Group:
         coefficients = footprint.coefficients(group.record, group.qx, group.qy)
         group_light = light.index_select(0, group.chunk.tiles)
         group_image = image.new_empty(len(group.chunk.tiles), D + 1, tile * tile)
-        for rows, k, (odds, weight, T) in memory.blocks(group.chunk):
-            _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], odds, weight, T)
-            torch.bmm(group.colors[rows, :k].mT, weight.mT, out=group_image[rows])
+        for rows, k, (weight, T) in memory.blocks(group.chunk):
+            _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], weight, T, weight, odds=False)
+            products(group.colors[rows, :k].mT, weight, out=group_image[rows])
         light.index_copy_(0, group.chunk.tiles, group_light)                                # no other group has these tiles
         image.index_add_(0, group.chunk.tiles, group_image)
         return group
 
     for _ in scene.run(blend_group, light):
         pass
+    if backgrounds is not None:                             # here, where a channel's pixels are beside each other
+        views = image.view(len(backgrounds), -1, *image.shape[1:])
+        views[:, :, :D].addcmul_(1 - views[:, :, D:], backgrounds[:, None, :, None])
     rendered, alphas = (to_image(channels, scene.lists.shape, width, height) for channels in (image[:, :D], image[:, D:]))
-    alphas = alphas[..., 0]
-    if backgrounds is not None:
-        rendered.addcmul_((1 - alphas)[..., None], backgrounds[:, None, None])
-    return rendered, alphas
+    return rendered, alphas[..., 0]
 
 
 def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, backgrounds: Tensor | None, ids: Tensor,
@@ -175,26 +206,27 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
     v_colors = colors.new_zeros(N, D) if shared else sums[:, 6:]
     v_abs = means2d.new_zeros(C * N if absgrad else 0, 2)
     highest = float(scene.records.new_tensor(alpha_max).div_(1 - scene.records.new_tensor(alpha_max)))     # rounded as odds are
-    memory = Memory(scene.records, tile * tile, D + 1, 4)
+    memory = Memory(scene.records, tile * tile, D + 1, 3)
 
     def backward_group(group: _Group) -> tuple[Tensor, Tensor, list[Tensor]]:
         coefficients = footprint.coefficients(group.record, group.qx, group.qy)
         slopes = footprint.mean_slopes(coefficients) if absgrad else ()
         group_light, group_rest, group_upstream = (v.index_select(0, group.chunk.tiles) for v in (light, rest, upstream))
         shape = group.chunk.padding.shape
-        moments, results = colors.new_zeros(shape[0], 6, shape[1]), colors.new_zeros(6 + D, *shape)
+        moments, results = colors.new_zeros(shape[0], 6, shape[1]), colors.new_empty(6 + D, *shape)
+        results[6:] = 0
         sums_abs = [torch.zeros_like(group.qx) for _ in slopes]
-        for rows, k, (odds, weight, T, v) in memory.blocks(group.chunk):
-            _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], odds, weight, T)
-            torch.bmm(group_upstream[rows].mT, group.colors[rows, :k].mT, out=v)            # g
-            results[6:, rows, :k] = torch.bmm(group_upstream[rows], weight)[:, :D].transpose(0, 1)  # 4 rows take less time than 3
-            _log_alpha_gradient(v, odds, weight, T, group_rest[rows])
+        for rows, k, (odds, weight, v) in memory.blocks(group.chunk):
+            _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], odds, weight, weight, odds=True)
+            products(group.colors[rows, :k], group_upstream[rows], out=v)                  # g
+            results[6:, rows, :k] = products(group_upstream[rows], weight.mT)[:, :D].transpose(0, 1)   # 4 rows take less time than 3
+            _log_alpha_gradient(v, odds, weight, group_rest[rows])
             if group.clamps:    # v = 0 where the odds are 0, as it is already, or those of alpha_max
                 torch.ops.aten.hardtanh_backward.grad_input(v, odds, 0.0, highest, grad_input=v)
-            moments[rows, :, :k] = torch.matmul(scene.monomials, v)     # a strided `out` is slow
+            moments[rows, :, :k] = products(scene.monomials, v.mT)    # a strided `out` is slow
             for slope, sum_abs in zip(slopes, sums_abs, strict=True):
-                torch.matmul(scene.monomials[:3].T, slope[rows, :, :k], out=T)
-                sum_abs[rows, :k] = T.mul_(v).abs_().sum(1)
+                products(slope[rows, :, :k].mT, scene.monomials[:3], out=weight)
+                sum_abs[rows, :k] = weight.mul_(v).abs_().sum(2)
         light.index_copy_(0, group.chunk.tiles, group_light)
         rest.index_copy_(0, group.chunk.tiles, group_rest)
         footprint.moments_about_mean(group.record, group.qx, group.qy, moments, results[:6])
@@ -212,13 +244,13 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
             v_colors.clone(memory_format=torch.contiguous_format).view(colors.shape), v_abs.view(C, -1, 2))
 
 
-def _log_alpha_gradient(v: Tensor, odds: Tensor, weight: Tensor, rests: Tensor, rest: Tensor) -> None:
-    """Turn v from g into dL/dlog alpha, in place; `rests` is room, and `rest` `[B, P]` in front of the chunk becomes that behind."""
+def _log_alpha_gradient(v: Tensor, odds: Tensor, weight: Tensor, rest: Tensor) -> None:
+    """Turn v from g into dL/dlog alpha, in place; `rest` `[B, P]` in front of the chunk becomes that behind, and weight minus that behind each
+    splat."""
     v.mul_(weight)
-    torch.cumsum(v, -1, out=rests)
-    rests.sub_(rest[..., None])                                                             # minus the rest behind each splat
-    torch.neg(rests[..., -1], out=rest)
-    v.addcmul_(odds, rests)
+    scan(torch.add, v, -rest, weight)
+    torch.neg(weight[:, -1], out=rest)
+    v.addcmul_(odds, weight)
 
 
 def _lit(light: Tensor) -> Tensor:

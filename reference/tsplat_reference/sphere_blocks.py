@@ -19,7 +19,7 @@ from tsplat_reference.binning import tile_counts
 from tsplat_reference.blending import to_image, to_tiles
 from tsplat_reference.camera import join_intrinsics, split_intrinsics
 from tsplat_reference.spheres import SphereImages
-from tsplat_reference.walk import Chunk, Memory, TileLists
+from tsplat_reference.walk import Chunk, Memory, TileLists, products
 
 LOG2_E = 1 / math.log(2)
 MISSED = 1e30
@@ -85,7 +85,7 @@ class SphereScene:
         k1 = o * (self.slope * LOG2_E)
         k0 = o * (LOG2_E * (1 + self.near / (self.far - self.near)) / self.gamma)
         if self.orthographic:
-            mono2, mono1, distance = self.monomials[None], self.monomials[None, :3], z
+            mono2, mono1, distance = self.monomials, self.monomials[:3], z
             beyond = bool((z - R).amin() < self.near) or bool(z.amax() > self.far)
         else:
             norm2 = self._norm2(rays)
@@ -183,8 +183,8 @@ class SphereGroup(NamedTuple):
     features: Tensor        # [G, K, D]
     quadratic: Tensor       # [G, 6, K]
     linear: Tensor          # [G, 3, K]
-    mono2: Tensor           # [G or 1, 6, P], over |m|^2
-    mono1: Tensor           # [G or 1, 3, P], over |m|
+    mono2: Tensor           # [G, 6, P], over |m|^2, or [6, P]
+    mono1: Tensor           # [G, 3, P], over |m|, or [3, P]
     distance: Tensor        # [G, K], of the centre
     k0: Tensor              # [G, K]: log2(e) o z/gamma = k0 + k1 D (exp2 takes 0.4 times as long as exp)
     k1: Tensor
@@ -192,27 +192,27 @@ class SphereGroup(NamedTuple):
 
     def part(self, rows: slice, k: int) -> SphereGroup:
         """Some of its tiles, and their first k spheres."""
-        mono2, mono1 = (m if len(m) == 1 else m[rows] for m in (self.mono2, self.mono1))
+        mono2, mono1 = (m if m.ndim == 2 else m[rows] for m in (self.mono2, self.mono1))
         return self._replace(record=self.record[:, rows, :k], features=self.features[rows, :k], quadratic=self.quadratic[rows, :, :k],
                              linear=self.linear[rows, :, :k], mono2=mono2, mono1=mono1, distance=self.distance[rows, :k],
                              k0=self.k0[rows, :k], k1=self.k1[rows, :k])
 
 
 def fill_hits(scene: SphereScene, g: SphereGroup, s: Tensor, h: Tensor, d: Tensor, D: Tensor) -> Tensor:
-    """Fill in, `[B, P, K]`: s = delta/R, h = half the length within the sphere over R, d = 1 - s (0 if missed), and D.
+    """Fill in, `[B, K, P]`: s = delta/R, h = half the length within the sphere over R, d = 1 - s (0 if missed), and D.
 
     Returns:
         with `chord`, 2/(1 + cos) of the angle between ray and centre, else nothing `[0]`.
     """
-    R = g.record[3][:, None]
-    torch.matmul(g.mono2.mT, g.quadratic, out=s)
+    R = g.record[3][..., None]
+    products(g.quadratic.mT, g.mono2, out=s)
     s.clamp_(0.0, 1.0)
-    torch.matmul(g.mono1.mT, g.linear, out=D)
+    products(g.linear.mT, g.mono1, out=D)
     torch.sub(1, s, out=h)
     h.sqrt_()
     factor = s.new_empty(0)
     if scene.chord:
-        factor = 2 / (1 + D / g.distance[:, None].clamp_min(torch.finfo(D.dtype).tiny))
+        factor = 2 / (1 + D / g.distance[..., None].clamp_min(torch.finfo(D.dtype).tiny))
         s.mul_(factor).clamp_(max=1.0)
     D.addcmul_(h, R, value=-1)
     s.sqrt_()
@@ -260,17 +260,17 @@ def blend_sphere_blocks(centers: Tensor, radii: Tensor, opacities: Tensor, featu
         for rows, k, (s, h, d, depths, e) in memory.blocks(chunk):
             g = group.part(rows, k)
             fill_hits(scene, g, s, h, d, depths)
-            torch.addcmul(g.k0[:, None], g.k1[:, None], depths, out=e)
+            torch.addcmul(g.k0[..., None], g.k1[..., None], depths, out=e)
             e.masked_fill_(d <= 0, -torch.inf)
-            now = torch.maximum(was[rows], e.amax(-1))
-            e.sub_(now[..., None]).exp2_().mul_(d.mul_(g.record[4][:, None]))
+            now = torch.maximum(was[rows], e.amax(1))
+            e.sub_(now[:, None]).exp2_().mul_(d.mul_(g.record[4][..., None]))
             shrink = (was[rows] - now).exp2_()
             was[rows] = now
-            sums[rows] = sums[rows] * shrink + e.sum(-1)
+            sums[rows] = sums[rows] * shrink + e.sum(1)
             images[rows] *= shrink[:, None]
-            images[rows, :D] += torch.bmm(g.features.mT, e.mT)
+            images[rows, :D] += products(g.features.mT, e)
             if depth:
-                images[rows, D] += e.mul_(depths).sum(-1)
+                images[rows, D] += e.mul_(depths).sum(1)
         for full, mine in ((peak, was), (total, sums), (image, images)):
             full.index_copy_(0, chunk.tiles, mine)
         return chunk
@@ -335,28 +335,28 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
         v_norm2 = centers.new_empty(G, tile * tile) if intrinsics and not scene.orthographic else None
         for rows, k, (s, h, d, depths, e, v, x) in memory.blocks(chunk):
             g, up = group.part(rows, k), ups[rows]
-            R, o = g.record[3][:, None], g.record[4][:, None]
+            R, o = g.record[3][..., None], g.record[4][..., None]
             factor = fill_hits(scene, g, s, h, d, depths)
-            torch.addcmul(g.k0[:, None], g.k1[:, None], depths, out=e)
-            e.sub_(up[:, D + 1, :, None]).clamp_(max=most).exp2_().masked_fill_(d <= 0, 0.0)
+            torch.addcmul(g.k0[..., None], g.k1[..., None], depths, out=e)
+            e.sub_(up[:, D + 1, None]).clamp_(max=most).exp2_().masked_fill_(d <= 0, 0.0)
             if cutoff is not None:
-                e.masked_fill_(depths > up[:, -1, :, None], 0.0)
+                e.masked_fill_(depths > up[:, -1, None], 0.0)
             torch.mul(e, d, out=x)
             x.mul_(o)                                                                       # w
-            v_features[rows, :, :k] = torch.bmm(up[:, :D], x)
-            torch.bmm(up[:, :D].mT, g.features.mT, out=v)
+            v_features[rows, :, :k] = products(up[:, :D], x.mT)
+            products(g.features, up[:, :D], out=v)
             if v_depth is not None:
-                v.addcmul_(depths, up[:, D + 2, :, None])
-            v.add_(up[:, D, :, None]).mul_(e)                                               # (g + softmax_gradient) e
+                v.addcmul_(depths, up[:, D + 2, None])
+            v.add_(up[:, D, None]).mul_(e)                                               # (g + softmax_gradient) e
             torch.mul(v, d, out=x)
-            torch.sum(x, 1, out=sums[0, rows, :k])
-            sums[1, rows, :k] = torch.mul(x, depths).sum(1)
+            torch.sum(x, 2, out=sums[0, rows, :k])
+            sums[1, rows, :k] = torch.mul(x, depths).sum(2)
             v_s = (v * o).neg_()                                                            # d = 1 - s
             along = v.mul_(o * (o * scene.slope))                                           # dL/dD over d
             if v_depth is not None:
-                along.addcmul_(e.mul_(o), up[:, D + 2, :, None])
+                along.addcmul_(e.mul_(o), up[:, D + 2, None])
             torch.mul(along, d, out=x)                                                      # dL/dD
-            sums[2, rows, :k] = -torch.mul(x, h).sum(1)                                     # D = a - R h
+            sums[2, rows, :k] = -torch.mul(x, h).sum(2)                                     # D = a - R h
             # dL/dt: h = sqrt(1 - t), and d/h = h/(1 + s) loses nothing at the outline (with chord, h is larger and division safe)
             v_t = along.mul_(d).div_(h.clamp(min=least)) if scene.chord else along.mul_(h).div_(s + 1)
             v_t.mul_(0.5 * R)
@@ -364,15 +364,15 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
             t = 1 - h * h
             if scene.chord:                                                                 # s^2 = t factor, factor = 2/(1 + a/distance)
                 v_t.addcmul_(v_s, factor)
-                v_factor = v_s.mul_(t).mul_(factor).mul_(factor).div_(2 * g.distance[:, None])
+                v_factor = v_s.mul_(t).mul_(factor).mul_(factor).div_(2 * g.distance[..., None])
                 x.sub_(v_factor)
-                sums[3, rows, :k] = (v_factor.mul_(depths + R * h) / g.distance[:, None]).sum(1)
+                sums[3, rows, :k] = (v_factor.mul_(depths + R * h) / g.distance[..., None]).sum(2)
             else:
                 v_t.add_(v_s)
-            m2[rows, :, :k] = torch.matmul(g.mono2, v_t)
-            m1[rows, :, :k] = torch.matmul(g.mono1, x)
+            m2[rows, :, :k] = products(g.mono2, v_t.mT)
+            m1[rows, :, :k] = products(g.mono1, x.mT)
             if v_norm2 is not None:
-                v_norm2[rows] = -(v_t.mul_(t) + x.mul_(depths.addcmul_(h, R)).mul_(0.5)).sum(-1)
+                v_norm2[rows] = -(v_t.mul_(t) + x.mul_(depths.addcmul_(h, R)).mul_(0.5)).sum(1)
         x0, x1, v_R, v_distance = sums
         xz = (1 + near / (far - near)) * x0 - x1 / (far - near)                             # sum of x z
         if v_norm2 is not None:

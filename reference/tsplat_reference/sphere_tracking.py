@@ -41,7 +41,7 @@ def nearest_hits(centers: Tensor, radii: Tensor, Ks: Tensor, ids: Tensor, offset
             fill_hits(scene, group.part(rows, k), s, h, d, D)
             D.masked_fill_(d <= 0, torch.inf)
             tiles = chunk.tiles[rows]
-            both = torch.cat([depths[tiles], D], -1)
+            both = torch.cat([depths[tiles], D.mT], -1)
             names = torch.cat([found[tiles], sphere[rows, None, :k].expand(-1, pixels, -1)], -1)
             best, order = both.topk(count, largest=False)
             depths[tiles] = best

@@ -15,8 +15,9 @@ R = TypeVar("R")
 
 CHUNK = 64
 """Splats of a tile per chunk. Finished pixels end with it, so more would waste work; fewer would pay the calls more often."""
-LANES = 16
-"""Chunks have a multiple of this many splats: with 7 or 8, matrix products take 5 times as long per pair as with 16."""
+LANES = 4
+"""Chunks have a multiple of this many splats: with others, matrix products of float64 round in another way, and the same tile would have other bits
+beside other tiles."""
 BLOCK = 1 << 19
 """Pairs in a block: its buffers of this size, 8 MB in float32 where there are four, are the working set of a thread. Smaller ones fit closer
 caches, but then the calls cost more than that gains (measured from 2^15 to 2^20), the more so with several threads, which wait for each
@@ -91,7 +92,7 @@ class TileLists:
 
 
 class Memory:
-    """Scratch memory for blocks: so many arrays `[B, P, K]`, which the blocks of a group, and then other groups, reuse."""
+    """Scratch memory for blocks: so many arrays `[B, K, P]`, which the blocks of a group, and then other groups, reuse."""
 
     def __init__(self, like: Tensor, pixels: int, channels: int, buffers: int) -> None:
         self.like, self.pixels, self.channels = like, pixels, channels
@@ -106,7 +107,7 @@ class Memory:
         while i < len(lengths):
             k = min(_whole(lengths[i]), longest)
             b = min(max(1, BLOCK // (self.pixels * max(k, self.channels))), len(lengths) - i)   # many channels: they set the working set
-            yield slice(i, i + b), k, memory[:, :b * self.pixels * k].view(-1, b, self.pixels, k).unbind(0)
+            yield slice(i, i + b), k, memory[:, :b * k * self.pixels].view(-1, b, k, self.pixels).unbind(0)
             i += b
         self.free.append(memory)
 
@@ -114,6 +115,18 @@ class Memory:
 def _whole(count: int) -> int:
     """The next multiple of LANES."""
     return -(-count // LANES) * LANES
+
+
+def products(a: Tensor, b: Tensor, out: Tensor | None = None) -> Tensor:
+    """Matrix products a @ b of `[B, m, n]` (or `[m, n]` for all alike) and `[B, n, p]` (likewise), with bits that do not depend on the number of
+    threads: of a single pair of matrices, torch.bmm calls another routine, which splits its sums over the threads. So a second one stands beside it.
+    """
+    count = max(len(m) for m in (a, b) if m.ndim == 3)
+    a, b = (m.expand(count, -1, -1) for m in (a, b))
+    if count > 1:
+        return torch.bmm(a, b) if out is None else torch.bmm(a, b, out=out)
+    single = torch.bmm(a.expand(2, -1, -1), b.expand(2, -1, -1))[:1]
+    return single if out is None else out.copy_(single)
 
 
 def _next(steps: Iterator[R]) -> R | None:

@@ -14,7 +14,7 @@ from torch.multiprocessing.reductions import StorageWeakRef
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves
 
-SMALL_BLOCKS = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "FEW": 1 << 6}
+SMALL_BLOCKS = {"CHUNK": 32, "BLOCK": 1 << 12, "GROUP": 1 << 8, "ALONE": 1 << 8, "FEW": 1 << 6}
 """Constants of `tsplat_reference.walk` with which little of a block's working memory is constant."""
 
 

@@ -44,7 +44,7 @@ def many_pieces(monkeypatch: pytest.MonkeyPatch) -> set[str]:
         return call(function, item)
 
     monkeypatch.setattr(parallel, "_call", named)
-    small = {"walk.GROUP": 512, "walk.WORTH_WORKERS": 0, "projection.CHUNK": 64, "harmonics.CHUNK": 64}
+    small = {"walk.GROUP": 512, "walk.ALONE": 512, "walk.WORTH_WORKERS": 0, "projection.CHUNK": 64, "harmonics.CHUNK": 64}
     for name, value in small.items():
         module, constant = name.split(".")
         monkeypatch.setattr(importlib.import_module(f"tsplat_reference.{module}"), constant, value)

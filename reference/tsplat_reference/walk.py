@@ -19,12 +19,15 @@ LANES = 4
 """Chunks have a multiple of this many splats: with others, matrix products of float64 round in another way, and the same tile would have other bits
 beside other tiles."""
 BLOCK = 1 << 19
-"""Pairs in a block: its buffers of this size, 8 MB in float32 where there are four, are the working set of a thread. Smaller ones fit closer
+"""Pairs in a block: its buffers of this size, 6 MB in float32 where there are three, are the working set of a thread. Smaller ones fit closer
 caches, but then the calls cost more than that gains (measured from 2^15 to 2^20), the more so with several threads, which wait for each
 other in Python."""
 GROUP = 1 << 16
 """Hits of a group of blocks, whose small operations (gathering, coefficients, scattering) are done together, by one thread: about 60
-numbers per hit, 16 MB in float32. With more than 8 channels a group has fewer hits. (Half as many: 1.07 times as long at 10k splats.)"""
+numbers per hit, 16 MB in float32. With more than 8 channels a group has fewer hits."""
+ALONE = 1 << 18
+"""Hits of a group that has all tiles, up to which there is only one: images of 512x512 in tiles of 8. Its calls are fewer, and OpenMP spreads each
+over the cores: 0.65 to 0.95 times as long as groups and workers, for 70k to 700k hits on two cores."""
 FEW = 1 << 13
 """Hits of a group below which its chunks grow, up to twofold each time: the calls for a few tiles with long lists cost more than their work."""
 WORTH_WORKERS = 1 << 15
@@ -63,7 +66,8 @@ class TileLists:
         other, each at its own pace: no core waits for the slowest group of a round. Without `grow`, all chunks begin at multiples of CHUNK.
         """
         tiles = self.counts.sort(descending=True, stable=True).indices[:int((self.counts > 0).sum())]     # longest lists first
-        size = max(1, GROUP * 9 // (CHUNK * max(9, channels)))
+        most, size = (max(1, hits * 9 // (CHUNK * max(9, channels))) for hits in (ALONE, GROUP))
+        size = len(tiles) if 0 < len(tiles) <= most else size
         worth = len(tiles) > size and int(self.counts.sum()) >= WORTH_WORKERS
         strands = [map(function, self._chunks(some, alive, grow)) for some in torch.split(tiles, size)]
         with workers(worth) as ordered_map:

@@ -34,10 +34,12 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from output import peak_memory
 
 from tsplat.scene import Gaussians
 from tsplat.scene.formats import find_format
+
+sys.path.append(str(Path(__file__).resolve().parent))               # tests import this file from elsewhere
+from output import peak_memory
 
 MEMORY = 64 << 20               # bytes by which the address space may grow
 SECONDS = 5

@@ -8,6 +8,7 @@ front of the next splat, and in the backward the rest: what is still to come, ti
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -135,7 +136,7 @@ def _scan_pairs(op: Callable[..., Tensor], x: Tensor) -> None:
     """In place, without a start; the last 8 one after the other, which are fewer calls."""
     if x.shape[1] <= 8:
         rows = x.unbind(1)
-        for before, row in zip(rows, rows[1:]):
+        for before, row in itertools.pairwise(rows):
             op(row, before, out=row)
     else:
         op(x[:, 1::2], x[:, :-1:2], out=x[:, 1::2])

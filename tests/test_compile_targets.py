@@ -34,7 +34,7 @@ def test_no_kernel_spills(target: str, tmp_path: Path) -> None:
     assert "may_see_kernel" in names
     assert any("harmonics" in n for n in names)
     assert {(k["kernel"], k["label"]): k["spills"] for k in kernels if k["spills"] != 0} == {}
-    for name in ("blend_bwd_kernel", "sphere_bwd_kernel") if target.startswith("sm_") else ():
+    for name in ("blend_bwd_kernel", "sphere_bwd_kernel") if target == "sm_90" else ():
         atomics = {k["label"]: sum(loop.get("atomic", 0) for loop in k["loops"]) for k in kernels if k["kernel"] == name}
         assert atomics["3 channels"] > 0
         assert atomics["3 channels, deterministic"] == 0

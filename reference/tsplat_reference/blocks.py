@@ -1,7 +1,7 @@
-"""Blending and its backward on a CPU: cache-sized blocks of tiles x pixels x splats, matrix products, in-place operations.
+"""Blending and its backward on a CPU: cache-sized blocks of tiles x splats x pixels, matrix products, in-place operations.
 
 The splats of a tile are taken in chunks. Blocks of tiles that still have splats and light left go through one chunk together: the
-polynomial of `footprint` gives log alpha as a matrix product, a cumulative product gives the transmittance, and colours, their
+polynomial of `footprint` gives log alpha as a matrix product, a running product gives the transmittance, and colours, their
 gradients and the moments for the geometry are matrix products again. Between chunks a pixel keeps its light, the transmittance in
 front of the next splat, and in the backward the rest: what is still to come, times the upstream gradient. Finished tiles drop out.
 """
@@ -88,9 +88,9 @@ def _scene(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, i
                   monomials, monomials / math.log(2))
 
 
-def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, alpha: Tensor, T: Tensor, weight: Tensor, odds: bool) -> None:
-    """Fill in alpha, or with `odds` alpha/(1 - alpha), 0 beyond the end of a pixel, T, the transmittance behind, and weight, the product of alpha
-    and the transmittance in front, which may take the room of either.
+def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, alpha: Tensor, T: Tensor, odds: bool) -> Tensor:
+    """Weights `[B, K, P]`, alpha times the transmittance in front. With `odds` they take the room of T, and that of alpha has alpha/(1 - alpha), 0
+    beyond the end of a pixel; else they take the room of alpha.
 
     `light` `[B, P]` is the transmittance in front of the chunk, and behind it on return.
     """
@@ -111,11 +111,13 @@ def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, al
             _keep_where(T[:, :-1], alpha[:, 1:])            # T in front of the others
             _keep_where(light, alpha[:, 0])
     if odds:
-        torch.mul(alpha, T, out=weight)
+        weight = T.mul_(alpha)
     else:
-        torch.mul(alpha[:, 0], light, out=weight[:, 0])
-        torch.mul(alpha[:, 1:], T[:, :-1], out=weight[:, 1:])
+        weight = alpha
+        weight[:, 0].mul_(light)
+        weight[:, 1:].mul_(T[:, :-1])
     light.copy_(behind)
+    return weight
 
 
 def scan(op: Callable[..., Tensor], x: Tensor, start: Tensor, out: Tensor) -> None:
@@ -163,8 +165,8 @@ def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Ten
         coefficients = footprint.coefficients(group.record, group.qx, group.qy)
         group_light = light.index_select(0, group.chunk.tiles)
         group_image = image.new_empty(len(group.chunk.tiles), D + 1, tile * tile)
-        for rows, k, (weight, T) in memory.blocks(group.chunk):
-            _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], weight, T, weight, odds=False)
+        for rows, k, (alpha, T) in memory.blocks(group.chunk):
+            weight = _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], alpha, T, odds=False)
             products(group.colors[rows, :k].mT, weight, out=group_image[rows])
         light.index_copy_(0, group.chunk.tiles, group_light)                                # no other group has these tiles
         image.index_add_(0, group.chunk.tiles, group_image)
@@ -217,14 +219,14 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
         moments, results = colors.new_zeros(shape[0], 6, shape[1]), colors.new_empty(6 + D, *shape)
         results[6:] = 0
         sums_abs = [torch.zeros_like(group.qx) for _ in slopes]
-        for rows, k, (odds, weight, v) in memory.blocks(group.chunk):
-            _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], odds, weight, weight, odds=True)
-            products(group.colors[rows, :k], group_upstream[rows], out=v)                  # g
-            results[6:, rows, :k] = products(group_upstream[rows], weight.mT)[:, :D].transpose(0, 1)   # 4 rows take less time than 3
+        for rows, k, (odds, T, v) in memory.blocks(group.chunk):
+            weight = _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], odds, T, odds=True)
+            products(group.colors[rows, :k], group_upstream[rows], out=v)                   # g
+            results[6:, rows, :k] = products(group_upstream[rows], weight.mT)[:, :D].transpose(0, 1)  # 4 rows take less time than 3
             _log_alpha_gradient(v, odds, weight, group_rest[rows])
             if group.clamps:    # v = 0 where the odds are 0, as it is already, or those of alpha_max
                 torch.ops.aten.hardtanh_backward.grad_input(v, odds, 0.0, highest, grad_input=v)
-            moments[rows, :, :k] = products(scene.monomials, v.mT)    # a strided `out` is slow
+            moments[rows, :, :k] = products(scene.monomials, v.mT)             # a strided `out` is slow
             for slope, sum_abs in zip(slopes, sums_abs, strict=True):
                 products(slope[rows, :, :k].mT, scene.monomials[:3], out=weight)
                 sum_abs[rows, :k] = weight.mul_(v).abs_().sum(2)

@@ -347,7 +347,7 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
             products(g.features, up[:, :D], out=v)
             if v_depth is not None:
                 v.addcmul_(depths, up[:, D + 2, None])
-            v.add_(up[:, D, None]).mul_(e)                                               # (g + softmax_gradient) e
+            v.add_(up[:, D, None]).mul_(e)                                                  # (g + softmax_gradient) e
             torch.mul(v, d, out=x)
             torch.sum(x, 2, out=sums[0, rows, :k])
             sums[1, rows, :k] = torch.mul(x, depths).sum(2)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 from collections.abc import Iterator
 
 import pytest
@@ -52,6 +54,23 @@ def test_one_compilation_serves_all_sizes(backend: Backend) -> None:
         assert_close(gradients(got, args), gradients(want, args), 1e-14)
         counts.append(counter.frame_count)  # the first compilation may make several attempts
     assert counts == [counts[0]] * 4
+
+
+@pytest.mark.usefixtures("fresh_dynamo")
+def test_the_default_compiler(backend: Backend) -> None:
+    """A loss and its gradients, as Inductor makes them: the others stop in front of it."""
+    if backend.device.type == "cpu" and shutil.which(os.environ.get("CXX", "g++")) is None:
+        pytest.skip("Inductor needs a C++ compiler on a CPU: install g++, or set CXX")
+
+    def loss(*args: Tensor) -> Tensor:
+        image, alpha, *_ = render(*args)
+        return (image.sigmoid() - 0.5).square().mean() + alpha.mean()
+
+    args = render_arguments(backend)
+    want = [loss(*args)]
+    got = [torch.compile(loss, fullgraph=True)(*args)]
+    assert_close(got, want, 1e-14)
+    assert_close(gradients(got, args), gradients(want, args), 1e-14)
 
 
 @pytest.mark.usefixtures("fresh_dynamo")

@@ -88,12 +88,21 @@ def _scene(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, i
                   monomials, monomials / math.log(2))
 
 
-def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, alpha: Tensor, T: Tensor, odds: bool) -> Tensor:
+class _Block:
+    """Room for the numbers of a block, `[B, K, P]` each."""
+
+    def __init__(self, alpha: Tensor, T: Tensor, v: Tensor) -> None:
+        self.alpha, self.T, self.v = alpha, T, v
+        self.products, self.sums = Scan(T, T), Scan(v, T)
+
+
+def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, block: _Block, odds: bool) -> Tensor:
     """Weights `[B, K, P]`, alpha times the transmittance in front. With `odds` they take the room of T, and that of alpha has alpha/(1 - alpha), 0
     beyond the end of a pixel; else they take the room of alpha.
 
     `light` `[B, P]` is the transmittance in front of the chunk, and behind it on return.
     """
+    alpha, T = block.alpha, block.T
     products(coefficients.mT, scene.exponents, out=alpha)
     torch.threshold_(alpha, LOG2_ALPHA_MIN, footprint.NOTHING)
     alpha.exp2_()
@@ -102,7 +111,7 @@ def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, al
     torch.sub(1, alpha, out=T)
     if odds:
         alpha.div_(T)
-    scan(torch.mul, T, light, T)
+    block.products.run(torch.mul, light)
     behind = T[:, -1].clone()
     if behind.amin() <= TRANSMITTANCE_MIN:                  # else no pixel ends here
         if scene.drop_last:
@@ -120,30 +129,32 @@ def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, al
     return weight
 
 
-def scan(op: Callable[..., Tensor], x: Tensor, start: Tensor, out: Tensor) -> None:
+class Scan:
     """Running sums or products along the second dimension: out[:, k] = start op x[:, 0] op .. op x[:, k]; `out` may be x.
 
     Of pairs, then of pairs of pairs, and back (Brent and Kung, 1982): twice the operations of torch.cumsum and cumprod, but these take one number
     after the other, which is 2 to 3 times as long.
     """
-    op(x[:, 0], start, out=out[:, 0])
-    if x.shape[1] > 1:
-        op(x[:, 1], out[:, 0], out=out[:, 1])
-        op(x[:, 3::2], x[:, 2:-1:2], out=out[:, 3::2])
-        _scan_pairs(op, out[:, 1::2])
-        op(x[:, 2::2], out[:, 1:-1:2], out=out[:, 2::2])
+
+    def __init__(self, x: Tensor, out: Tensor) -> None:
+        self.first, self.steps = (x[:, 0], out[:, 0]), []
+        if x.shape[1] > 1:
+            self.steps = [(x[:, 1], out[:, 0], out[:, 1]), (x[:, 3::2], x[:, 2:-1:2], out[:, 3::2]), *_steps(out[:, 1::2]),
+                          (x[:, 2::2], out[:, 1:-1:2], out[:, 2::2])]
+
+    def run(self, op: Callable[..., Tensor], start: Tensor) -> None:
+        """With what is in x now."""
+        x, out = self.first
+        op(x, start, out=out)
+        for a, b, c in self.steps:
+            op(a, b, out=c)
 
 
-def _scan_pairs(op: Callable[..., Tensor], x: Tensor) -> None:
+def _steps(x: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
     """In place, without a start; the last 8 one after the other, which are fewer calls."""
     if x.shape[1] <= 8:
-        rows = x.unbind(1)
-        for before, row in itertools.pairwise(rows):
-            op(row, before, out=row)
-    else:
-        op(x[:, 1::2], x[:, :-1:2], out=x[:, 1::2])
-        _scan_pairs(op, x[:, 1::2])
-        op(x[:, 2::2], x[:, 1:-1:2], out=x[:, 2::2])
+        return [(row, before, row) for before, row in itertools.pairwise(x.unbind(1))]
+    return [(x[:, 1::2], x[:, :-1:2], x[:, 1::2]), *_steps(x[:, 1::2]), (x[:, 2::2], x[:, 1:-1:2], x[:, 2::2])]
 
 
 def _keep_where(T: Tensor, x: Tensor) -> None:
@@ -159,14 +170,14 @@ def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Ten
     D = colors.shape[-1]
     light = _light(scene, width, height)
     image = light.new_zeros(len(light), D + 1, tile * tile)
-    memory = Memory(scene.records, tile * tile, D + 1, 2)
+    memory = Memory(scene.records, tile * tile, D + 1, 2, lambda alpha, T: _Block(alpha, T, T))
 
     def blend_group(group: _Group) -> _Group:
         coefficients = footprint.coefficients(group.record, group.qx, group.qy)
         group_light = light.index_select(0, group.chunk.tiles)
         group_image = image.new_empty(len(group.chunk.tiles), D + 1, tile * tile)
-        for rows, k, (alpha, T) in memory.blocks(group.chunk):
-            weight = _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], alpha, T, odds=False)
+        for rows, k, block in memory.blocks(group.chunk):
+            weight = _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], block, odds=False)
             products(group.colors[rows, :k].mT, weight, out=group_image[rows])
         light.index_copy_(0, group.chunk.tiles, group_light)                                # no other group has these tiles
         image.index_add_(0, group.chunk.tiles, group_image)
@@ -209,7 +220,7 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
     v_colors = colors.new_zeros(N, D) if shared else sums[:, 6:]
     v_abs = means2d.new_zeros(C * N if absgrad else 0, 2)
     highest = float(scene.records.new_tensor(alpha_max).div_(1 - scene.records.new_tensor(alpha_max)))     # rounded as odds are
-    memory = Memory(scene.records, tile * tile, D + 1, 3)
+    memory = Memory(scene.records, tile * tile, D + 1, 3, _Block)
 
     def backward_group(group: _Group) -> tuple[Tensor, Tensor, list[Tensor]]:
         coefficients = footprint.coefficients(group.record, group.qx, group.qy)
@@ -219,17 +230,22 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
         moments, results = colors.new_zeros(shape[0], 6, shape[1]), colors.new_empty(6 + D, *shape)
         results[6:] = 0
         sums_abs = [torch.zeros_like(group.qx) for _ in slopes]
-        for rows, k, (odds, T, v) in memory.blocks(group.chunk):
-            weight = _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], odds, T, odds=True)
+        for rows, k, block in memory.blocks(group.chunk):
+            odds, v = block.alpha, block.v
+            weight = _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], block, odds=True)
             products(group.colors[rows, :k], group_upstream[rows], out=v)                   # g
             results[6:, rows, :k] = products(group_upstream[rows], weight.mT)[:, :D].transpose(0, 1)  # 4 rows take less time than 3
-            _log_alpha_gradient(v, odds, weight, group_rest[rows])
+            v.mul_(weight)
+            block.sums.run(torch.add, -group_rest[rows])
+            rests = block.T                                                                 # minus the rest behind each splat
+            torch.neg(rests[:, -1], out=group_rest[rows])
+            v.addcmul_(odds, rests)                                                         # dL/dlog alpha
             if group.clamps:    # v = 0 where the odds are 0, as it is already, or those of alpha_max
                 torch.ops.aten.hardtanh_backward.grad_input(v, odds, 0.0, highest, grad_input=v)
             moments[rows, :, :k] = products(scene.monomials, v.mT)             # a strided `out` is slow
             for slope, sum_abs in zip(slopes, sums_abs, strict=True):
-                products(slope[rows, :, :k].mT, scene.monomials[:3], out=weight)
-                sum_abs[rows, :k] = weight.mul_(v).abs_().sum(2)
+                products(slope[rows, :, :k].mT, scene.monomials[:3], out=rests)
+                sum_abs[rows, :k] = rests.mul_(v).abs_().sum(2)
         light.index_copy_(0, group.chunk.tiles, group_light)
         rest.index_copy_(0, group.chunk.tiles, group_rest)
         footprint.moments_about_mean(group.record, group.qx, group.qy, moments, results[:6])
@@ -245,15 +261,6 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
     v_means2d, v_conics, v_opacities = footprint.records_backward(scene.records, opacities.flatten(), sums[:, :6])
     return (v_means2d.view_as(means2d), v_conics.view_as(conics), v_opacities.view_as(opacities),
             v_colors.clone(memory_format=torch.contiguous_format).view(colors.shape), v_abs.view(C, -1, 2))
-
-
-def _log_alpha_gradient(v: Tensor, odds: Tensor, weight: Tensor, rest: Tensor) -> None:
-    """Turn v from g into dL/dlog alpha, in place; `rest` `[B, P]` in front of the chunk becomes that behind, and weight minus that behind each
-    splat."""
-    v.mul_(weight)
-    scan(torch.add, v, -rest, weight)
-    torch.neg(weight[:, -1], out=rest)
-    v.addcmul_(odds, weight)
 
 
 def _lit(light: Tensor) -> Tensor:

@@ -19,7 +19,7 @@ from tsplat_reference.binning import tile_counts
 from tsplat_reference.blending import to_image, to_tiles
 from tsplat_reference.camera import join_intrinsics, split_intrinsics
 from tsplat_reference.spheres import SphereImages
-from tsplat_reference.walk import Chunk, Memory, TileLists, products
+from tsplat_reference.walk import Chunk, Memory, TileLists, arrays, products
 
 LOG2_E = 1 / math.log(2)
 MISSED = 1e30
@@ -239,7 +239,7 @@ def blend_sphere_blocks(centers: Tensor, radii: Tensor, opacities: Tensor, featu
     background = backgrounds.repeat_interleave(lists.shape[1] * lists.shape[2], 0)[..., None]
     image = torch.cat([background.expand(-1, -1, pixels), centers.new_zeros(tiles, int(depth), pixels)], 1)
     used = lists.counts.clone()
-    memory = Memory(centers, pixels, D + 1, 5)
+    memory = Memory(centers, pixels, D + 1, 5, arrays)
     nearest = scene.records[:, 2] if scene.orthographic else torch.linalg.vector_norm(scene.records[:, :3], dim=1)
     nearest = nearest - scene.records[:, 3]
 
@@ -322,7 +322,7 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
     planes += [] if v_depth is None else [v_depth[..., None]]
     planes += [] if cutoff is None else [cutoff[..., None]]
     upstream = to_tiles(torch.cat(planes, -1), tile)                                        # [tiles, D + 2.., P]
-    memory = Memory(centers, tile * tile, D + 1, 7)
+    memory = Memory(centers, tile * tile, D + 1, 7, arrays)
     most = -math.log2(torch.finfo(centers.dtype).tiny)                                      # of e, where o or d is next to nothing
     least = math.sqrt(torch.finfo(centers.dtype).eps) / 2       # of s: below, a ray goes through the centre as far as its rounding tells
 

@@ -9,7 +9,7 @@ from tsplat_reference.blending import to_image
 from tsplat_reference.camera import split_intrinsics
 from tsplat_reference.sphere_blocks import SphereScene, fill_hits
 from tsplat_reference.spheres import ray_hits
-from tsplat_reference.walk import Chunk, Memory
+from tsplat_reference.walk import Chunk, Memory, arrays
 
 
 def nearest_hits(centers: Tensor, radii: Tensor, Ks: Tensor, ids: Tensor, offsets: Tensor, count: int, width: int, height: int, tile: int,
@@ -25,7 +25,7 @@ def nearest_hits(centers: Tensor, radii: Tensor, Ks: Tensor, ids: Tensor, offset
     lists, pixels = scene.lists, tile * tile
     depths = centers.new_full((len(lists.counts), pixels, count), torch.inf)
     found = torch.full(depths.shape, -1, dtype=torch.int32, device=depths.device)
-    memory = Memory(centers, pixels, count, 4)
+    memory = Memory(centers, pixels, count, 4, arrays)
     nearest = scene.records[:, 2] if scene.orthographic else torch.linalg.vector_norm(scene.records[:, :3], dim=1)
     nearest = nearest - scene.records[:, 3]
 

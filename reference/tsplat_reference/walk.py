@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple, TypeVar
+from typing import Generic, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from torch import Tensor
 from tsplat_reference.parallel import workers
 
 R = TypeVar("R")
+V = TypeVar("V")
 
 CHUNK = 64
 """Splats of a tile per chunk. Finished pixels end with it, so more would waste work; fewer would pay the calls more often."""
@@ -95,25 +96,33 @@ class TileLists:
             tiles, counts = tiles.index_select(0, live), counts.index_select(0, live)
 
 
-class Memory:
-    """Scratch memory for blocks: so many arrays `[B, K, P]`, which the blocks of a group, and then other groups, reuse."""
+class Memory(Generic[V]):
+    """Scratch memory for blocks, which the blocks of a group, and then other groups, reuse: so many arrays `[B, K, P]`, and what `views` makes of
+    them, once for all blocks of one shape, as slicing takes as long as the operations of a small block."""
 
-    def __init__(self, like: Tensor, pixels: int, channels: int, buffers: int) -> None:
-        self.like, self.pixels, self.channels = like, pixels, channels
+    def __init__(self, like: Tensor, pixels: int, channels: int, buffers: int, views: Callable[..., V]) -> None:
+        self.like, self.pixels, self.channels, self.views = like, pixels, channels, views
         self.shape = buffers, max(BLOCK, pixels * CHUNK)
-        self.free: list[Tensor] = []
+        self.free: list[tuple[Tensor, dict[tuple[int, int], V]]] = []
 
-    def blocks(self, chunk: Chunk) -> Iterator[tuple[slice, int, tuple[Tensor, ...]]]:
-        """Blocks of the tiles of a chunk: their rows, how many splats of each tile are all that are not padding, and the arrays, contiguous."""
-        memory = self.free.pop() if self.free else self.like.new_empty(self.shape)
+    def blocks(self, chunk: Chunk) -> Iterator[tuple[slice, int, V]]:
+        """Blocks of the tiles of a chunk: their rows, how many splats of each tile are all that are not padding, and the views."""
+        memory, known = self.free.pop() if self.free else (self.like.new_empty(self.shape), {})
         lengths, longest = chunk.lengths, chunk.padding.shape[1]
         i = 0
         while i < len(lengths):
             k = min(_whole(lengths[i]), longest)
             b = min(max(1, BLOCK // (self.pixels * max(k, self.channels))), len(lengths) - i)   # many channels: they set the working set
-            yield slice(i, i + b), k, memory[:, :b * k * self.pixels].view(-1, b, k, self.pixels).unbind(0)
+            if (b, k) not in known:
+                known[b, k] = self.views(*memory[:, :b * k * self.pixels].view(-1, b, k, self.pixels).unbind(0))
+            yield slice(i, i + b), k, known[b, k]
             i += b
-        self.free.append(memory)
+        self.free.append((memory, known))
+
+
+def arrays(*room: Tensor) -> tuple[Tensor, ...]:
+    """The views of a block that needs no others."""
+    return room
 
 
 def _whole(count: int) -> int:

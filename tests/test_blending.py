@@ -14,7 +14,7 @@ import tsplat_reference as reference
 from backends import Backend
 from compare import SMALL_BLOCKS, Peak, assert_close, assert_same_bits, gradients, leaves, strided, threads
 from torch import Tensor
-from tsplat_reference import blending, footprint, walk
+from tsplat_reference import blending, blocks, footprint, walk
 
 from tsplat import ops
 
@@ -147,6 +147,31 @@ def test_chunks_blocks_and_groups_change_nothing(monkeypatch: pytest.MonkeyPatch
     assert_close(got[2:], want[2:], 1e-12)
     with threads(2):
         assert_same_bits(run(), got)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 8, 9, 15, 16, 17, 18, 19, 36, 64, 101])
+def test_running_sums_and_products(count: int) -> None:
+    """Against torch's, to some roundings; in place, too."""
+    g = scenes.generator(count)
+    x, start = (torch.rand(shape, generator=g, dtype=torch.float64) * 0.1 + 0.95 for shape in ((2, count, 3), (2, 3)))
+    out = torch.empty_like(x)
+    blocks.Scan(x, out).run(torch.add, start)
+    assert_close(out, x.cumsum(1) + start[:, None], 1e-14)
+    want = x.cumprod(1) * start[:, None]
+    blocks.Scan(x, x).run(torch.mul, start)
+    assert_close(x, want, 1e-14)
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+@pytest.mark.parametrize("pairs", [1, 2])
+def test_products_have_the_same_bits_with_any_number_of_threads(pairs: int, dtype: torch.dtype) -> None:
+    """Where torch's do not, of a single pair of matrices."""
+    a, results = torch.rand(6, 64, dtype=dtype), []
+    for count in (1, 2):
+        with threads(count):
+            torch.manual_seed(0)
+            results.append([walk.products(a, torch.rand(pairs, k, 64, dtype=dtype).mT) for k in (5, 17, 64, 127, 500, 3001)])
+    assert_same_bits(*results)
 
 
 def test_the_formula_does_not_depend_on_its_groups(monkeypatch: pytest.MonkeyPatch) -> None:

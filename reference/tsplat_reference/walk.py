@@ -29,6 +29,8 @@ numbers per hit, 16 MB in float32. With more than 8 channels a group has fewer h
 ALONE = 1 << 18
 """Hits of a group that has all tiles, up to which there is only one: images of 512x512 in tiles of 8. Its calls are fewer, and OpenMP spreads each
 over the cores: 0.65 to 0.95 times as long as groups and workers, for 70k to 700k hits on two cores."""
+SHAPES = 64
+"""Shapes of blocks whose views are kept, of some 30 kB each."""
 FEW = 1 << 13
 """Hits of a group below which its chunks grow, up to twofold each time: the calls for a few tiles with long lists cost more than their work."""
 WORTH_WORKERS = 1 << 15
@@ -107,13 +109,18 @@ class Memory(Generic[V]):
 
     def blocks(self, chunk: Chunk) -> Iterator[tuple[slice, int, V]]:
         """Blocks of the tiles of a chunk: their rows, how many splats of each tile are all that are not padding, and the views."""
-        memory, known = self.free.pop() if self.free else (self.like.new_empty(self.shape), {})
+        try:                                                # not asked first: another thread may take it in between
+            memory, known = self.free.pop()
+        except IndexError:
+            memory, known = self.like.new_empty(self.shape), {}
         lengths, longest = chunk.lengths, chunk.padding.shape[1]
         i = 0
         while i < len(lengths):
             k = min(_whole(lengths[i]), longest)
             b = min(max(1, BLOCK // (self.pixels * max(k, self.channels))), len(lengths) - i)   # many channels: they set the working set
             if (b, k) not in known:
+                if len(known) >= SHAPES:
+                    known.clear()
                 known[b, k] = self.views(*memory[:, :b * k * self.pixels].view(-1, b, k, self.pixels).unbind(0))
             yield slice(i, i + b), k, known[b, k]
             i += b

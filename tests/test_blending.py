@@ -162,9 +162,20 @@ def test_running_sums_and_products(count: int) -> None:
     assert_close(x, want, 1e-14)
 
 
+def test_padding_changes_no_bit_of_running_sums() -> None:
+    """Lists are padded to the length of the longest beside them."""
+    x, start = torch.rand(2, 64, 3), torch.rand(2, 3)
+    whole = torch.empty_like(x)
+    blocks.Scan(x, whole).run(torch.add, start)
+    for count in range(1, 64):
+        part = torch.empty_like(x[:, :count])
+        blocks.Scan(x[:, :count], part).run(torch.add, start)
+        assert_same_bits([part], [whole[:, :count]])
+
+
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("pairs", [1, 2])
-def test_products_have_the_same_bits_with_any_number_of_threads(pairs: int, dtype: torch.dtype) -> None:
+def test_products_have_the_same_bits_on_one_and_two_threads(pairs: int, dtype: torch.dtype) -> None:
     """Where torch's do not, of a single pair of matrices."""
     a, results = torch.rand(6, 64, dtype=dtype), []
     for count in (1, 2):

@@ -81,7 +81,10 @@ def test_working_memory_does_not_grow_with_the_pairs_of_pixels_and_spheres(monke
         assert by_default > 4 * allowed                                               # the measure does see the working memory
 
 
-def test_threads_change_no_bit() -> None:
+def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With workers."""
+    for name, value in (("GROUP", 512), ("ALONE", 512), ("WORTH_WORKERS", 0)):
+        monkeypatch.setattr(walk, name, value)
     s, camera = scenes.spheres(3000, size=(0.05, 0.3)), scenes.camera(2, 130, 90)
     results = []
     for count in (1, 3):
@@ -90,6 +93,7 @@ def test_threads_change_no_bit() -> None:
             p, f, R, o = mine
             r = tsplat.render_spheres(p, f, R, camera, opacities=o, gamma=0.05, near=NEAR, far=FAR)
             results.append([r.image, r.alpha, *gradients([r.image, r.alpha], mine)])
+    assert_same_bits(*results)
 
 
 @pytest.mark.parametrize("dynamic", [False, True])

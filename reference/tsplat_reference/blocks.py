@@ -8,7 +8,6 @@ front of the next splat, and in the backward the rest: what is still to come, ti
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -88,21 +87,12 @@ def _scene(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, i
                   monomials, monomials / math.log(2))
 
 
-class _Block:
-    """Room for the numbers of a block, `[B, K, P]` each."""
-
-    def __init__(self, alpha: Tensor, T: Tensor, v: Tensor) -> None:
-        self.alpha, self.T, self.v = alpha, T, v
-        self.products, self.sums = Scan(T, T), Scan(v, T)
-
-
-def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, block: _Block, odds: bool) -> Tensor:
+def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, alpha: Tensor, T: Tensor, transmit: Scan, odds: bool) -> Tensor:
     """Weights `[B, K, P]`, alpha times the transmittance in front. With `odds` they take the room of T, and that of alpha has alpha/(1 - alpha), 0
     beyond the end of a pixel; else they take the room of alpha.
 
     `light` `[B, P]` is the transmittance in front of the chunk, and behind it on return.
     """
-    alpha, T = block.alpha, block.T
     products(coefficients.mT, scene.exponents, out=alpha)
     torch.threshold_(alpha, LOG2_ALPHA_MIN, footprint.NOTHING)
     alpha.exp2_()
@@ -111,7 +101,7 @@ def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, bl
     torch.sub(1, alpha, out=T)
     if odds:
         alpha.div_(T)
-    block.products.run(torch.mul, light)
+    transmit.run(torch.mul, light)
     behind = T[:, -1].clone()
     if behind.amin() <= TRANSMITTANCE_MIN:                  # else no pixel ends here
         if scene.drop_last:
@@ -151,10 +141,19 @@ class Scan:
 
 
 def _steps(x: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """In place, without a start; the last 8 one after the other, which are fewer calls."""
-    if x.shape[1] <= 8:
-        return [(row, before, row) for before, row in itertools.pairwise(x.unbind(1))]
-    return [(x[:, 1::2], x[:, :-1:2], x[:, 1::2]), *_steps(x[:, 1::2]), (x[:, 2::2], x[:, 1:-1:2], x[:, 2::2])]
+    """In place, without a start. Which numbers are joined first does not depend on how many there are: padding changes no bit."""
+    if x.shape[1] < 2:
+        return []
+    steps = [(x[:, 1::2], x[:, :-1:2], x[:, 1::2]), *_steps(x[:, 1::2])]
+    return steps if x.shape[1] == 2 else [*steps, (x[:, 2::2], x[:, 1:-1:2], x[:, 2::2])]
+
+
+def _forward_room(alpha: Tensor, T: Tensor) -> tuple[Tensor, Tensor, Scan]:
+    return alpha, T, Scan(T, T)
+
+
+def _backward_room(odds: Tensor, T: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Scan, Scan]:
+    return odds, T, v, Scan(T, T), Scan(v, T)
 
 
 def _keep_where(T: Tensor, x: Tensor) -> None:
@@ -170,14 +169,14 @@ def blend_blocks(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Ten
     D = colors.shape[-1]
     light = _light(scene, width, height)
     image = light.new_zeros(len(light), D + 1, tile * tile)
-    memory = Memory(scene.records, tile * tile, D + 1, 2, lambda alpha, T: _Block(alpha, T, T))
+    memory = Memory(scene.records, tile * tile, D + 1, 2, _forward_room)
 
     def blend_group(group: _Group) -> _Group:
         coefficients = footprint.coefficients(group.record, group.qx, group.qy)
         group_light = light.index_select(0, group.chunk.tiles)
         group_image = image.new_empty(len(group.chunk.tiles), D + 1, tile * tile)
-        for rows, k, block in memory.blocks(group.chunk):
-            weight = _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], block, odds=False)
+        for rows, k, room in memory.blocks(group.chunk):
+            weight = _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], *room, odds=False)
             products(group.colors[rows, :k].mT, weight, out=group_image[rows])
         light.index_copy_(0, group.chunk.tiles, group_light)                                # no other group has these tiles
         image.index_add_(0, group.chunk.tiles, group_image)
@@ -220,7 +219,7 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
     v_colors = colors.new_zeros(N, D) if shared else sums[:, 6:]
     v_abs = means2d.new_zeros(C * N if absgrad else 0, 2)
     highest = float(scene.records.new_tensor(alpha_max).div_(1 - scene.records.new_tensor(alpha_max)))     # rounded as odds are
-    memory = Memory(scene.records, tile * tile, D + 1, 3, _Block)
+    memory = Memory(scene.records, tile * tile, D + 1, 3, _backward_room)
 
     def backward_group(group: _Group) -> tuple[Tensor, Tensor, list[Tensor]]:
         coefficients = footprint.coefficients(group.record, group.qx, group.qy)
@@ -230,22 +229,20 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
         moments, results = colors.new_zeros(shape[0], 6, shape[1]), colors.new_empty(6 + D, *shape)
         results[6:] = 0
         sums_abs = [torch.zeros_like(group.qx) for _ in slopes]
-        for rows, k, block in memory.blocks(group.chunk):
-            odds, v = block.alpha, block.v
-            weight = _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], block, odds=True)
+        for rows, k, (odds, T, v, transmit, add_up) in memory.blocks(group.chunk):
+            weight = _weights(scene, coefficients[rows, :, :k], group.clamps, group_light[rows], odds, T, transmit, odds=True)
             products(group.colors[rows, :k], group_upstream[rows], out=v)                   # g
             results[6:, rows, :k] = products(group_upstream[rows], weight.mT)[:, :D].transpose(0, 1)  # 4 rows take less time than 3
             v.mul_(weight)
-            block.sums.run(torch.add, -group_rest[rows])
-            rests = block.T                                                                 # minus the rest behind each splat
-            torch.neg(rests[:, -1], out=group_rest[rows])
-            v.addcmul_(odds, rests)                                                         # dL/dlog alpha
+            add_up.run(torch.add, -group_rest[rows])                                        # to T: minus the rest behind each splat
+            torch.neg(T[:, -1], out=group_rest[rows])
+            v.addcmul_(odds, T)                                                             # dL/dlog alpha
             if group.clamps:    # v = 0 where the odds are 0, as it is already, or those of alpha_max
                 torch.ops.aten.hardtanh_backward.grad_input(v, odds, 0.0, highest, grad_input=v)
             moments[rows, :, :k] = products(scene.monomials, v.mT)             # a strided `out` is slow
             for slope, sum_abs in zip(slopes, sums_abs, strict=True):
-                products(slope[rows, :, :k].mT, scene.monomials[:3], out=rests)
-                sum_abs[rows, :k] = rests.mul_(v).abs_().sum(2)
+                products(slope[rows, :, :k].mT, scene.monomials[:3], out=T)
+                sum_abs[rows, :k] = T.mul_(v).abs_().sum(2)
         light.index_copy_(0, group.chunk.tiles, group_light)
         rest.index_copy_(0, group.chunk.tiles, group_rest)
         footprint.moments_about_mean(group.record, group.qx, group.qy, moments, results[:6])

@@ -1,8 +1,8 @@
 """Independent pieces of work on all cores: a thread for each, in which torch's operations are single-threaded.
 
-Operations on arrays that fit in a cache take 10 to 100 us, too short for torch to split each of them over the cores: measured on two
-cores, that gains nothing, and whole pieces of work on either core gain a factor of 1.9. Results come in the order of the pieces, so
-that sums over them have the same bits in every run and with any number of threads.
+Operations on arrays that fit in a cache take 10 to 100 us, short for torch to split each of them over the cores: that gains less than whole
+pieces of work on either core, if there are many of these and they are large. Results come in the order of the pieces, so that sums over them have
+the same bits in every run and with any number of threads.
 """
 
 from __future__ import annotations

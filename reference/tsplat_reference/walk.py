@@ -28,14 +28,14 @@ GROUP = 1 << 16
 numbers per hit, 16 MB in float32. With more than 8 channels a group has fewer hits."""
 ALONE = 1 << 18
 """Hits of a group that has all tiles, up to which there is only one: images of 512x512 in tiles of 8. Its calls are fewer, and OpenMP spreads each
-over the cores: 0.65 to 0.95 times as long as groups and workers, for 70k to 700k hits on two cores."""
+over the cores: 0.65 to 0.95 times as long as groups and workers, for 70k to 700k hits on two cores. Up to 64 MB in float32."""
 SHAPES = 64
-"""Shapes of blocks whose views are kept, of some 30 kB each."""
+"""Shapes of blocks whose views are kept, of some 50 kB each."""
 FEW = 1 << 13
 """Hits of a group below which its chunks grow, up to twofold each time: the calls for a few tiles with long lists cost more than their work."""
 WORTH_WORKERS = 1 << 15
-"""Hits from which worker threads gain, if there are several groups: at 70k, two threads take 0.9 times as long as without workers, at 9k 1.3
-times. (With more groups and smaller ones, threads wait for each other in Python: 1.15 times as long with half as many tiles in each.)"""
+"""Hits from which worker threads gain, if there are several groups. (Measured with groups of 1,024 tiles on images of any size: at 70k, two threads
+took 0.9 times as long as without workers, at 9k 1.3 times.)"""
 
 
 class Chunk(NamedTuple):
@@ -63,7 +63,8 @@ class TileLists:
 
     def run(self, function: Callable[[Chunk], R], alive: Callable[[Tensor, int], Tensor | None], channels: int, grow: bool = True
             ) -> Iterator[R]:
-        """The results of `function` of all that is to do, in an order that the number of threads does not change.
+        """The results of `function` of all that is to do, in an order that the number of threads does not change. (Bits may: where a group is
+        alone, OpenMP splits operations, and torch.exp2 of float32 rounds the last numbers of a part in another way.)
 
         `alive(tiles, begin)` says which tiles need their splats from `begin` on (None: all). Groups of tiles go front to back beside each
         other, each at its own pace: no core waits for the slowest group of a round. Without `grow`, all chunks begin at multiples of CHUNK.
@@ -138,8 +139,9 @@ def _whole(count: int) -> int:
 
 
 def products(a: Tensor, b: Tensor, out: Tensor | None = None) -> Tensor:
-    """Matrix products a @ b of `[B, m, n]` (or `[m, n]` for all alike) and `[B, n, p]` (likewise), with bits that do not depend on the number of
-    threads: of a single pair of matrices, torch.bmm calls another routine, which splits its sums over the threads. So a second one stands beside it.
+    """Matrix products a @ b of `[B, m, n]` (or `[m, n]` for all alike) and `[B, n, p]` (likewise), with the same bits on one and on two threads: of
+    a single pair of matrices, torch.bmm calls another routine, which splits its sums. So a second one stands beside it. (With more threads than
+    matrices, MKL splits these, too, and the last bits of float64 may differ.)
     """
     count = max(len(m) for m in (a, b) if m.ndim == 3)
     a, b = (m.expand(count, -1, -1) for m in (a, b))

@@ -139,7 +139,7 @@ def test_chunks_blocks_and_groups_change_nothing(monkeypatch: pytest.MonkeyPatch
         return [*outputs, *gradients(outputs, [*inputs, probe])]
 
     want = run()
-    for name, value in (("CHUNK", chunk), ("BLOCK", block), ("GROUP", group), ("ALONE", group), ("WORTH_WORKERS", 0)):
+    for name, value in (("CHUNK", chunk), ("BLOCK", block), ("GROUP", group), ("ALONE", group), ("SHAPES", 1), ("WORTH_WORKERS", 0)):
         monkeypatch.setattr(walk, name, value)
     with threads(1):
         got = run()

@@ -120,7 +120,7 @@ def _weights(scene: _Scene, coefficients: Tensor, clamp: bool, light: Tensor, al
 
 
 class Scan:
-    """Running sums or products along the second dimension: out[:, k] = start op x[:, 0] op .. op x[:, k]; `out` may be x.
+    """Running sums or products of x `[B, K, P]` from start `[B, P]`: out[:, k] = start op x[:, 0] op .. op x[:, k]; `out` `[B, K, P]` may be x.
 
     Of pairs, then of pairs of pairs, and back (Brent and Kung, 1982): twice the operations of torch.cumsum and cumprod, but these take one number
     after the other, which is 2 to 3 times as long.
@@ -149,10 +149,12 @@ def _steps(x: Tensor) -> list[tuple[Tensor, Tensor, Tensor]]:
 
 
 def _forward_room(alpha: Tensor, T: Tensor) -> tuple[Tensor, Tensor, Scan]:
+    """A block's arrays, and the running product of T in place."""
     return alpha, T, Scan(T, T)
 
 
 def _backward_room(odds: Tensor, T: Tensor, v: Tensor) -> tuple[Tensor, Tensor, Tensor, Scan, Scan]:
+    """A block's arrays, the running product of T in place, and the running sum of v, in the room of T."""
     return odds, T, v, Scan(T, T), Scan(v, T)
 
 
@@ -239,7 +241,7 @@ def blend_blocks_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, co
             v.addcmul_(odds, T)                                                             # dL/dlog alpha
             if group.clamps:    # v = 0 where the odds are 0, as it is already, or those of alpha_max
                 torch.ops.aten.hardtanh_backward.grad_input(v, odds, 0.0, highest, grad_input=v)
-            moments[rows, :, :k] = products(scene.monomials, v.mT)             # a strided `out` is slow
+            moments[rows, :, :k] = products(scene.monomials, v.mT)                          # a strided `out` is slow
             for slope, sum_abs in zip(slopes, sums_abs, strict=True):
                 products(slope[rows, :, :k].mT, scene.monomials[:3], out=T)
                 sum_abs[rows, :k] = T.mul_(v).abs_().sum(2)

@@ -176,6 +176,7 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
     v_M = matmul(G, transpose(F))
 
     # M = J W
+    v_W = matmul(transpose(J), v_M) if cameras else []
     v_u, v_v = (torch.where(valid, v, 0.0) for v in v_means2d.unbind(-1))
     (v_x, v_y, v_z), v_Ks = project_points_backward(p, intrinsics, width, height, model, v_u, v_v, matmul(v_M, transpose(W)))
     v_p = [torch.as_tensor(v, dtype=det.dtype) for v in (v_x, v_y, v_z)]
@@ -185,7 +186,6 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
 
     # p = W mean + t
     v_viewmats, v_Ks = (torch.zeros_like(viewmats), v_Ks) if cameras else (viewmats.new_empty(0, 4, 4), Ks.new_empty(0, 3, 3))
-    v_W = matmul(transpose(J), v_M) if cameras else []
     for i, v in enumerate(v_p if cameras else ()):
         for j in range(3):
             v_viewmats[:, i, j] = total(v_W[i][j], det) + v @ mean[j]

@@ -17,8 +17,8 @@ V = TypeVar("V")
 CHUNK = 64
 """Splats of a tile per chunk. Finished pixels end with it, so more would waste work; fewer would pay the calls more often."""
 LANES = 4
-"""Chunks have a multiple of this many splats: with others, matrix products of float64 round in another way, and the same tile would have other bits
-beside other tiles."""
+"""Chunks have a multiple of this many splats: with others, matrix products of float64 round in another way, and the alphas of a tile would have other
+bits beside other tiles."""
 BLOCK = 1 << 19
 """Pairs in a block: its buffers of this size, 6 MB in float32 where there are three, are the working set of a thread. Smaller ones fit closer
 caches, but then the calls cost more than that gains (measured from 2^15 to 2^20), the more so with several threads, which wait for each

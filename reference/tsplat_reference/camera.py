@@ -99,10 +99,9 @@ def _pinhole_axis_backward(x: Tensor, z: Tensor, f: Tensor, c: Tensor, size: int
     low, high = _frustum(f, c, size)
     t = x / z
     f_z = f / z
-    below, above = t < low, t > high
     clamped = torch.minimum(torch.maximum(t, low), high)
     v_clamped = -f_z * v_jz
-    v_limit = torch.where(below | above, v_clamped, 0.0)
+    v_limit = torch.where(t != clamped, v_clamped, 0.0)
     v_t = f * v_u + v_clamped - v_limit
     v_f_z = v_jx - clamped * v_jz
     # low = -(c + margin)/f, high = (size - c + margin)/f: d/df = -limit/f, d/dc = -1/f

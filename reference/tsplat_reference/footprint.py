@@ -35,20 +35,20 @@ def records(means2d: Tensor, conics: Tensor, opacities: Tensor) -> Tensor:
     """`[R, RECORD]`: mean x, mean y, s, p, r and log opacity of splats `[R, 2]`, `[R, 3]`, `[R]`, and their coefficients of x^2, xy and y^2, which
     are those of any tile; finite for culled ones (conic 0)."""
     a, b, c = conics.unbind(-1)
-    s = torch.where(a > 0, b / torch.where(a > 0, a, 1.0), 0.0)
+    s = torch.where(a > 0, b / a, 0.0)
     p, r = -a, (b * s - c).clamp_max(0.0)
     log_opacity = torch.log(opacities.clamp_min(torch.finfo(opacities.dtype).tiny))
     return torch.stack([*means2d.unbind(-1), s, p, r, log_opacity, 0.5 * p, p * s, 0.5 * torch.addcmul(r, p * s, s)], -1)
 
 
 def records_backward(records: Tensor, opacities: Tensor, sums: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Gradients with respect to means2d, conics and opacities, from the `sums` `[R, 6]` of `moments_about_mean` over all tiles."""
+    """Gradients with respect to means2d, conics and opacities, from the `sums` `[6, R]` of `moments_about_mean` over all tiles."""
     s, p, r = records[:, 2:5].unbind(-1)
-    v, vu, vy, vuu, vuy, vyy = sums.unbind(-1)
+    v, vu, vy, vuu, vuy, vyy = sums
     along_x = -p * vu                                                                       # du/dmx = -1, du/dmy = -s, ddy/dmy = -1
     half = -0.5 * vyy
     v_conics = torch.stack([torch.addcmul(-0.5 * vuu, s, torch.addcmul(vuy, s, half)), s * vyy - vuy, half], -1)    # dx = u - s dy
-    v_opacities = torch.where(opacities > 0, v / torch.where(opacities > 0, opacities, 1.0), 0.0)
+    v_opacities = torch.where(opacities > 0, v / opacities, 0.0)
     return torch.stack([along_x, s * along_x - r * vy], -1), v_conics, v_opacities
 
 

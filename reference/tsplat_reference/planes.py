@@ -35,9 +35,10 @@ def transpose(a: Matrix) -> list[list[Plane]]:
     return [list(column) for column in zip(*a, strict=True)]
 
 
-def cross(a: Vector, b: Vector) -> list[Plane]:
+def cross(a: Vector, b: Vector) -> list[Tensor]:
     """Vector product of 3-vectors."""
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    x, y, z = ([torch.as_tensor(p) for p in pair] for pair in zip(a, b, strict=True))
+    return [torch.addcmul(p[0] * q[1], q[0], p[1], value=-1) for p, q in ((y, z), (z, x), (x, y))]
 
 
 def split(tensor: Tensor) -> list[Tensor]:

@@ -38,40 +38,52 @@ class Projection(NamedTuple):
 def rotation_matrix(quat: Vector) -> Matrix:
     """The rotation of unit quaternions (w, x, y, z)."""
     w, x, y, z = quat
-    return [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
+    x2, y2, z2 = 2 * x, 2 * y, 2 * z
+    xx, yy, zz, xy, yz, zx, wx, wy, wz = x * x2, y * y2, z * z2, x * y2, y * z2, z * x2, w * x2, w * y2, w * z2
+    return [[1 - (yy + zz), xy - wz, zx + wy],
+            [xy + wz, 1 - (xx + zz), yz - wx],
+            [zx - wy, yz + wx, 1 - (xx + yy)]]
 
 
 def covariances(quats: Tensor, scales: Tensor) -> Tensor:
     """Sigma = R S S^T R^T `[N, 3, 3]` (3DGS, equation 6) of quaternions `[N, 4]`, not zero, and scales `[N, 3]`."""
-    F = _factor([*split(quats), *split(scales)])
+    F = _factor([*split(quats), *split(scales)]).F
     return torch.stack([join(row, quats[:, 0]) for row in matmul(F, transpose(F))], -2)
 
 
-def _factor(shape: Sequence[Tensor]) -> Matrix:
-    """F = R S, so that Sigma = F F^T, of quaternion and scales."""
-    R = rotation_matrix(_normalise(shape[:4])[0])
-    return [[r * s for r, s in zip(row, shape[4:], strict=True)] for row in R]
+class _Factor(NamedTuple):
+    """F = R S, so that Sigma = F F^T, the rotation R of the unit quaternion, and the norm of the raw one."""
+
+    F: Matrix
+    R: Matrix
+    unit: Vector
+    norm: Tensor
 
 
-def _factor_backward(shape: Sequence[Tensor], v_F: Matrix) -> tuple[list[Plane], list[Plane]]:
+def _factor(shape: Sequence[Tensor]) -> _Factor:
+    """Of planes of quaternion and scales."""
+    norm = torch.as_tensor(dot(shape[:4], shape[:4])).sqrt()
+    unit = [q / norm for q in shape[:4]]
+    R = rotation_matrix(unit)
+    return _Factor(_times(R, shape[4:]), R, unit, norm)
+
+
+def _factor_backward(factor: _Factor, scales: Vector, v_F: Matrix) -> tuple[list[Plane], list[Plane]]:
     """Gradients with respect to the raw quaternion and the scales."""
-    unit, norm = _normalise(shape[:4])
-    v_scale = [dot(v, r) for v, r in zip(transpose(v_F), transpose(rotation_matrix(unit)), strict=True)]
-    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = [[v * s for v, s in zip(row, shape[4:], strict=True)] for row in v_F]
-    w, x, y, z = unit
-    v_unit = [2 * (x * (r21 - r12) + y * (r02 - r20) + z * (r10 - r01)),
-              2 * (-2 * x * (r11 + r22) + y * (r01 + r10) + z * (r02 + r20) + w * (r21 - r12)),
-              2 * (x * (r01 + r10) - 2 * y * (r00 + r22) + z * (r12 + r21) + w * (r02 - r20)),
-              2 * (x * (r02 + r20) + y * (r12 + r21) - 2 * z * (r00 + r11) + w * (r10 - r01))]
+    v_scale = [dot(v, r) for v, r in zip(transpose(v_F), transpose(factor.R), strict=True)]
+    (r00, r01, r02), (r10, r11, r12), (r20, r21, r22) = _times(v_F, [2 * s for s in scales])
+    a, b, c = r21 - r12, r02 - r20, r10 - r01            # the antisymmetric part of v_R, and sums of its symmetric part
+    xy, zx, yz = r01 + r10, r02 + r20, r12 + r21
+    w, x, y, z = unit = factor.unit
+    v_unit = [dot((x, y, z), (a, b, c)), dot((x, y, z, w), (-2 * (r11 + r22), xy, zx, a)),
+              dot((x, y, z, w), (xy, -2 * (r00 + r22), yz, b)), dot((x, y, z, w), (zx, yz, -2 * (r00 + r11), c))]
     along = dot(unit, v_unit)
-    return [(v - u * along) / norm for u, v in zip(unit, v_unit, strict=True)], v_scale
+    return [(v - u * along) / factor.norm for u, v in zip(unit, v_unit, strict=True)], v_scale
 
 
-def _normalise(quat: Vector) -> tuple[list[Plane], Tensor]:
-    norm = torch.as_tensor(dot(quat, quat)).sqrt()
-    return [q / norm for q in quat], norm
+def _times(A: Matrix, diagonal: Vector) -> list[list[Plane]]:
+    """A times a diagonal matrix."""
+    return [[a * d for a, d in zip(row, diagonal, strict=True)] for row in A]
 
 
 def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: Tensor | None, opacities: Tensor, viewmats: Tensor,
@@ -95,26 +107,23 @@ def project(means: Tensor, quats: Tensor | None, scales: Tensor | None, covars: 
     mean, shape = split(means), _shape(quats, scales, covars)
     sane = _sane(mean, shape, opacities)
     mean, shape = _or_harmless(sane, mean, shape)
-    W = _rotation(viewmats)
-    p, valid = _in_range(_to_camera(mean, W, viewmats), sane, model, near, far)
+    W, t = _pose(viewmats)
+    p, valid = _in_range(_to_camera(mean, W, t), sane, model, near, far)
     u, v, J = project_points(p, split_intrinsics(Ks), width, height, model)
-    _, a0, b, c0, det_sharp = _covariance2d(matmul(J, W), _matrix(shape), covars is None)
+    F = _factor(shape).F if covars is None else _rows(shape)
+    _, a0, b, c0, det_sharp = _covariance2d(matmul(J, W), F, covars is None)
     a, c, det = a0 + eps2d, c0 + eps2d, det_sharp + eps2d * (a0 + c0 + eps2d)
     valid = valid & (det > 0) & (det < math.inf)
-    a, b, c, det = (torch.where(valid, v, 1.0) for v in (a, b, c, det))
+    a, b, c, det, det_sharp = _or(valid, (a, b, c, det, det_sharp), [1.0] * 5)
 
     compensations = torch.ones_like(det)
     if antialiased:
-        compensations = (torch.where(valid, det_sharp, 1.0) / det).clamp_min(COMPENSATION_MIN**2).sqrt()
+        compensations = (det_sharp / det).clamp_min(COMPENSATION_MIN**2).sqrt()
     rx, ry = _extents(a.detach(), c.detach(), opacities.detach() * compensations.detach())
     valid = valid & _on_screen(u.detach(), v.detach(), rx, ry, width, height)
-    inverse = torch.where(valid, 1 / det, 0.0)
-    return Projection(
-        join([torch.where(valid, rx, 0.0), torch.where(valid, ry, 0.0)], rx).to(torch.int32),
-        join([torch.where(valid, u, 0.0), torch.where(valid, v, 0.0)], u),
-        torch.where(valid, p[2], 0.0),
-        join([c * inverse, -b * inverse, a * inverse], det),
-        torch.where(valid, compensations, 0.0))
+    rx, ry, u, v, depths, inverse, compensations = _or(valid, (rx, ry, u, v, p[2], det.reciprocal(), compensations), [0.0] * 7)
+    return Projection(join([rx, ry], rx).to(torch.int32), join([u, v], u), depths, join([c * inverse, -b * inverse, a * inverse], det),
+                      compensations)
 
 
 class ProjectionGradients(NamedTuple):
@@ -143,11 +152,12 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
                                    torch.stack([p.Ks for p in parts]).sum(0))
     valid = (radii[..., 0] > 0) & (radii[..., 1] > 0)                                       # [C, N]
     mean, shape = _or_harmless(valid.any(0), split(means), _shape(quats, scales, covars))
-    W = _rotation(viewmats)
-    p = _or_ahead(valid, _to_camera(mean, W, viewmats))
+    W, t = _pose(viewmats)
+    p = _or_ahead(valid, _to_camera(mean, W, t))
     intrinsics = split_intrinsics(Ks)
     _, _, J = project_points(p, intrinsics, width, height, model)
-    M, F = matmul(J, W), _matrix(shape)
+    factor = _factor(shape) if covars is None else None
+    M, F = matmul(J, W), factor.F if factor else _rows(shape)
     T, a0, b, c0, det_sharp = _covariance2d(M, F, covars is None)
     trace = a0 + c0 + eps2d
     a, c, det = a0 + eps2d, c0 + eps2d, det_sharp + eps2d * trace
@@ -155,13 +165,13 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
     # conic Q = (A, B, C) = (c, -b, a)/det, the inverse of Sigma': v_Sigma' = -Q v_Q Q, where B stands for both entries off the diagonal.
     # What is needed is G = 2 v_Sigma' T, or 2 v_Sigma' M if Sigma is given, by way of X = adj(Sigma' before blur) T/det and Q T, not of
     # v_Sigma', of which most cancels in the product with a long T
-    inverse = 1 / det
+    inverse = det.reciprocal()
     blur = eps2d * inverse
     v_A, v_B, v_C = v_conics.unbind(-1)
     V, Q = [[-2 * v_A, -v_B], [-v_B, -2 * v_C]], [[c * inverse, -b * inverse], [-b * inverse, a * inverse]]
     if covars is None:
         normal = [n * inverse for n in cross(*T)]
-        X = [cross(T[1], normal), cross(normal, T[0])]
+        X: Matrix = [cross(T[1], normal), cross(normal, T[0])]
     else:
         T, X = M, matmul([[c0 * inverse, Q[0][1]], [Q[1][0], a0 * inverse]], M)
     G = matmul(Q, matmul(V, _combine(X, blur, T)))
@@ -169,19 +179,20 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
         ratio = det_sharp * inverse
         v_ratio = torch.where(ratio >= COMPENSATION_MIN**2, v_compensations / ratio.sqrt(), 0.0) * blur
         G = _combine(_combine(G, v_ratio * trace, X), -v_ratio * ratio, T)
-    G = [[torch.where(valid, g, 0.0) for g in row] for row in G]
+    G = [[*_or(valid, [torch.as_tensor(g) for g in row], [0.0] * 3)] for row in G]
 
     # Sigma' = T T^T, T = M F; or M Sigma M^T
-    v_F = [[torch.as_tensor(v).sum(0) for v in row] for row in matmul(transpose(M), G)]
+    v_F = [_over_cameras(row) for row in matmul(transpose(M), G)]
     v_M = matmul(G, transpose(F))
 
     # M = J W
     v_W = matmul(transpose(J), v_M) if cameras else []
-    v_u, v_v = (torch.where(valid, v, 0.0) for v in v_means2d.unbind(-1))
-    (v_x, v_y, v_z), v_Ks = project_points_backward(p, intrinsics, width, height, model, v_u, v_v, matmul(v_M, transpose(W)))
+    v_u, v_v = _or(valid, v_means2d.unbind(-1), [0.0] * 2)
+    v_J = matmul(v_M, transpose(W))
+    (v_x, v_y, v_z), v_Ks = project_points_backward(p, intrinsics, width, height, model, v_u, v_v, v_J)
     v_p = [torch.as_tensor(v, dtype=det.dtype) for v in (v_x, v_y, v_z)]
     if v_depths is not None:
-        v_p[2] = v_p[2] + torch.where(valid, v_depths, 0.0)
+        v_p[2] = v_p[2] + _or(valid, [v_depths], [0.0])[0]
     v_p = [v.expand_as(det) for v in v_p]
 
     # p = W mean + t
@@ -190,11 +201,11 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
         for j in range(3):
             v_viewmats[:, i, j] = total(v_W[i][j], det) + v @ mean[j]
         v_viewmats[:, i, 3] = v.sum(1)
-    v_means = join([torch.as_tensor(dot(column, v_p)).sum(0) for column in transpose(W)], mean[0])
-    if covars is not None:
+    v_means = join(_over_cameras([dot(column, v_p) for column in transpose(W)]), mean[0])
+    if factor is None:
         v_covars = join([0.5 * v for row in v_F for v in row], mean[0]).view(-1, 3, 3)
         return ProjectionGradients(v_means, None, None, v_covars, v_viewmats, v_Ks)
-    v_quat, v_scale = _factor_backward(shape, v_F)
+    v_quat, v_scale = _factor_backward(factor, shape[4:], v_F)
     return ProjectionGradients(v_means, join(v_quat, mean[0]), join(v_scale, mean[0]), None, v_viewmats, v_Ks)
 
 
@@ -216,15 +227,15 @@ def _shape(quats: Tensor | None, scales: Tensor | None, covars: Tensor | None) -
     return split(quats) + split(scales)
 
 
-def _matrix(shape: Sequence[Tensor]) -> Matrix:
-    """F = R S, so that Sigma = F F^T; or Sigma itself."""
-    return [shape[i:i + 3] for i in (0, 3, 6)] if len(shape) == 9 else _factor(shape)
-
-
 def _or_harmless(keep: Tensor, mean: Sequence[Tensor], shape: Sequence[Tensor]) -> tuple[list[Tensor], list[Tensor]]:
     """Harmless numbers in place of splats that are not kept, so that nothing of them (NaN, say) reaches a sum over splats."""
     harmless = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0) if len(shape) == 9 else (1.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0)
-    return [torch.where(keep, v, 0.0) for v in mean], [torch.where(keep, v, h) for v, h in zip(shape, harmless, strict=True)]
+    return _or(keep, mean, [0.0] * 3), _or(keep, shape, harmless)
+
+
+def _or(keep: Tensor, planes: Sequence[Tensor], others: Sequence[float]) -> list[Tensor]:
+    """The planes where `keep`, and elsewhere the others. A choice takes as long as four products, so that none is made where all are kept."""
+    return list(planes) if bool(keep.all()) else [torch.where(keep, p, other) for p, other in zip(planes, others, strict=True)]
 
 
 def _sane(mean: Sequence[Tensor], shape: Sequence[Tensor], opacities: Tensor) -> Tensor:
@@ -241,19 +252,26 @@ def _largest(planes: Sequence[Tensor]) -> Tensor:
     return functools.reduce(torch.maximum, [p.abs() for p in planes])
 
 
-def _rotation(viewmats: Tensor) -> Matrix:
-    """W, with planes `[C, 1]`."""
-    return [[viewmats[:, i, j, None] for j in range(3)] for i in range(3)]
+def _rows(planes: Sequence[Tensor]) -> Matrix:
+    """A 3 x 3 matrix of its entries, row by row."""
+    return [planes[i:i + 3] for i in (0, 3, 6)]
 
 
-def _to_camera(mean: Vector, W: Matrix, viewmats: Tensor) -> Point:
-    x, y, z = (dot(row, mean) + viewmats[:, i, 3, None] for i, row in enumerate(W))
+def _pose(viewmats: Tensor) -> tuple[Matrix, Sequence[Tensor]]:
+    """W and t, with planes `[C, 1]`."""
+    rows = [row.unbind(1) for row in viewmats[:, :3, :, None].unbind(1)]
+    return [row[:3] for row in rows], [row[3] for row in rows]
+
+
+def _to_camera(mean: Vector, W: Matrix, t: Sequence[Tensor]) -> Point:
+    x, y, z = (dot(row, mean) + shift for row, shift in zip(W, t, strict=True))
     return x, y, z
 
 
 def _or_ahead(valid: Tensor, p: Point) -> Point:
     """The points, with (0, 0, 1) for those that are not valid."""
-    return torch.where(valid, p[0], 0.0), torch.where(valid, p[1], 0.0), torch.where(valid, p[2], 1.0)
+    x, y, z = _or(valid, p, (0.0, 0.0, 1.0))
+    return x, y, z
 
 
 def _in_range(p: Point, sane: Tensor, model: str, near: float, far: float) -> tuple[Point, Tensor]:
@@ -280,7 +298,12 @@ def _covariance2d(M: Matrix, F: Matrix, factored: bool) -> tuple[list[list[Plane
 
 def _combine(A: Matrix, b: Tensor, B: Matrix) -> list[list[Plane]]:
     """A + b B."""
-    return [[x + b * y for x, y in zip(*rows, strict=True)] for rows in zip(A, B, strict=True)]
+    return [[torch.addcmul(torch.as_tensor(x), b, torch.as_tensor(y)) for x, y in zip(*rows, strict=True)] for rows in zip(A, B, strict=True)]
+
+
+def _over_cameras(planes: Vector) -> list[Tensor]:
+    """Planes `[C, N]` summed to `[N]`."""
+    return [v[0] if len(v) == 1 else v.sum(0) for v in map(torch.as_tensor, planes)]
 
 
 def _extents(a: Tensor, c: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:

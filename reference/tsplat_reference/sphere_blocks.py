@@ -19,7 +19,7 @@ from tsplat_reference.binning import tile_counts
 from tsplat_reference.blending import to_image, to_tiles
 from tsplat_reference.camera import join_intrinsics, split_intrinsics
 from tsplat_reference.spheres import SphereImages
-from tsplat_reference.walk import Chunk, Memory, TileLists, arrays, products
+from tsplat_reference.walk import Chunk, Memory, TileLists, arrays, empty_sums, products
 
 LOG2_E = 1 / math.log(2)
 MISSED = 1e30
@@ -74,7 +74,7 @@ class SphereScene:
     def group(self, chunk: Chunk) -> SphereGroup:
         """Geometry of the spheres and the rays of a chunk."""
         lists, shape = self.lists, chunk.padding.shape
-        record = self.records.index_select(0, chunk.splats).T.contiguous().view(5, *shape)
+        record = torch.stack(self.records.index_select(0, chunk.splats).unbind(-1)).view(5, *shape)        # in half the time of a transposed copy
         kx, ky, cx, cy = self.intrinsics[chunk.tiles // (lists.shape[1] * lists.shape[2])].unbind(1)
         tile_x, tile_y = lists.centers(chunk.tiles, record.dtype)
         qx, qy = tile_x - cx, tile_y - cy
@@ -385,15 +385,14 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
         v_o = x0 + o * xz / scene.gamma
         return group, torch.cat([v_geometry, v_o[None]]), v_features, -(o * o * xz).sum() / scene.gamma**2, v_K
 
-    # a sphere's numbers beside each other in memory: as planes, index_add would take three times as long
-    v_records, v_table = centers.new_zeros(C * N, 5).T, centers.new_zeros(len(scene.features), D)
+    v_records, v_table = empty_sums(5, C * N, centers), empty_sums(D, len(scene.features), centers)
     v_Ks = centers.new_zeros(C, 4)
     for group, v_record, v_features, v_g, v_K in lists.run(backward, lambda tiles, begin: None, D + 1):
         v_records.index_add_(1, group.chunk.splats, v_record.flatten(1))
-        v_table.T.index_add_(1, group.rows, v_features.transpose(0, 1).reshape(D, -1))
+        v_table.index_add_(1, group.rows, v_features.transpose(0, 1).reshape(D, -1))
         v_gamma += v_g
         v_Ks.index_add_(0, group.chunk.tiles // (lists.shape[1] * lists.shape[2]), v_K)
     v_records = v_records.view(5, C, N)
     v_radii, v_opacities = (v if len(x) == C else v.sum(0, keepdim=True) for v, x in ((v_records[3], radii), (v_records[4], opacities)))
-    return SphereGradients(v_records[:3].permute(1, 2, 0), v_radii, v_opacities, v_table.view(features.shape), v_backgrounds, v_gamma,
+    return SphereGradients(v_records[:3].permute(1, 2, 0), v_radii, v_opacities, v_table.T.reshape(features.shape), v_backgrounds, v_gamma,
                            join_intrinsics(*v_Ks.T[..., None]))

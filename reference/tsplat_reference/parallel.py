@@ -100,13 +100,23 @@ def _single_threaded() -> None:
     torch.set_num_threads(1)
 
 
+def single_threaded_pool(threads: int, name: str) -> ThreadPoolExecutor:
+    """Threads in which torch's operations are single-threaded: for what is beside the work that all cores are for.
+
+    Each thread with parallel operations has OpenMP threads of its own, as long as it lives. If there are more of these than cores, OpenMP (GNU's)
+    no longer lets them spin while they wait for each other, but sleep: everything in the process takes up to twice as long.
+    """
+    others = torch.get_num_threads()
+    pool = ThreadPoolExecutor(threads, name, initializer=_single_threaded)
+    started = threading.Barrier(threads)
+    for future in [pool.submit(started.wait) for _ in range(threads)]:
+        future.result()
+    torch.set_num_threads(others)                       # the setting is each thread's own, except for threads yet to come
+    return pool
+
+
 def _pool(threads: int) -> ThreadPoolExecutor:
     with _lock:
         if threads not in _pools:
-            pool = ThreadPoolExecutor(threads, "tsplat", initializer=_single_threaded)
-            started = threading.Barrier(threads)
-            for future in [pool.submit(started.wait) for _ in range(threads)]:
-                future.result()
-            torch.set_num_threads(threads)              # the setting is each thread's own, except for threads yet to come
-            _pools[threads] = pool
+            _pools[threads] = single_threaded_pool(threads, "tsplat")
         return _pools[threads]

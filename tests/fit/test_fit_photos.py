@@ -164,17 +164,19 @@ def test_depth_maps_pull_splats_to_their_depth(capture: Capture, config: Make, t
     assert errors[1] < 0.5 * errors[0]
 
 
-def test_photos_are_read_ahead_by_one_other_thread(capture: Capture) -> None:
-    threads = []
+@pytest.mark.parametrize("one_core", [False, True])
+def test_photos_are_read_ahead_by_one_other_thread(one_core: bool) -> None:
+    threads, cores = [], torch.get_num_threads()
 
     class Images:
         def __getitem__(self, index: int) -> torch.Tensor:
             threads.append(threading.current_thread())
+            assert torch.get_num_threads() == (1 if one_core else cores)
             if index == 9:
                 raise ValueError("photo 9: expected an image")
             return torch.full((1,), float(index))
 
-    with PhotoStream(Images()) as stream:      # type: ignore[arg-type]
+    with PhotoStream(Images(), one_core=one_core) as stream:      # type: ignore[arg-type]
         assert float(stream[3]) == 3
         stream.prepare(4)
         assert float(stream[5]) == 5                                   # another than was prepared
@@ -185,6 +187,7 @@ def test_photos_are_read_ahead_by_one_other_thread(capture: Capture) -> None:
     assert len(set(threads)) == 1
     assert threading.current_thread() not in threads
     assert not threads[0].is_alive()
+    assert torch.get_num_threads() == cores
 
 
 def test_growth_that_does_not_fit_stops_before_it(capture: Capture, config: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

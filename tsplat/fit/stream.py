@@ -6,6 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from types import TracebackType
 
 from torch import Tensor
+from tsplat_reference.parallel import single_threaded_pool
 
 from tsplat.scene.images import ImageStore
 
@@ -14,11 +15,15 @@ class PhotoStream:
     """`images[i]`, of which the next can be asked for beforehand.
 
     A context manager: at the end of the block the thread ends.
+
+    Args:
+        images: to read from.
+        one_core: whether the rest is for something else, a fit on a CPU (see `single_threaded_pool`).
     """
 
-    def __init__(self, images: ImageStore) -> None:
+    def __init__(self, images: ImageStore, *, one_core: bool = False) -> None:
         self._images = images
-        self._worker = ThreadPoolExecutor(1, thread_name_prefix="photos")
+        self._worker = single_threaded_pool(1, "photos") if one_core else ThreadPoolExecutor(1, "photos")
         self._next: tuple[int, Future[Tensor]] | None = None
 
     def __getitem__(self, index: int) -> Tensor:

@@ -242,7 +242,7 @@ def _train(state: FitState, capture: Capture, config: FitConfig, output: Output 
     """All steps that are left."""
     before, begin, kept = state.seconds, time.perf_counter(), state.step          # kept: the step of the last checkpoint; 0: there is none
     with (deferred_interrupt() as interrupt, progress_line(config.steps, state.step, shown=progress) as show,
-          PhotoStream(capture.images) as images):
+          PhotoStream(capture.images, one_core=state.device.type == "cpu") as images):
         while state.step < config.steps:
             try:
                 step = train_step(state, capture, config, images)

@@ -12,7 +12,7 @@ import torch
 import tsplat_reference as reference
 from backends import Backend
 from torch import Tensor
-from tsplat_reference import constants
+from tsplat_reference import binning, constants
 
 from tsplat import ops
 
@@ -226,3 +226,13 @@ def test_a_splat_visible_along_one_axis_only_is_culled() -> None:
     radii = s.radii.clone()
     radii[0, 0, 1] = 0
     assert set(bins(s._replace(radii=radii), 30, 20, 8).ids.tolist()) <= {1}
+
+
+@pytest.mark.parametrize("dtype", [torch.int16, torch.int32, torch.int64])
+@pytest.mark.parametrize("count", [0, binning.RADIX // 4 - 1, binning.RADIX // 4, 20_000, binning.RADIX - 1, binning.RADIX])
+def test_integers_are_sorted_stably_with_padding_and_without(count: int, dtype: torch.dtype) -> None:
+    """The largest ones, which are those of padding, too."""
+    info = torch.iinfo(dtype)
+    keys = torch.tensor([info.max, 7, -3, info.min])[torch.randint(4, (count,), generator=scenes.generator(count))].to(dtype)
+    for ours, torchs in zip(binning._sort(keys), keys.sort(stable=True), strict=True):
+        assert torch.equal(ours, torchs)

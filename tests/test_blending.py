@@ -139,7 +139,7 @@ def test_chunks_blocks_and_groups_change_nothing(monkeypatch: pytest.MonkeyPatch
         return [*outputs, *gradients(outputs, [*inputs, probe])]
 
     want = run()
-    for name, value in (("CHUNK", chunk), ("BLOCK", block), ("GROUP", group), ("ALONE", group), ("SHAPES", 1), ("WORTH_WORKERS", 0)):
+    for name, value in (("CHUNK", chunk), ("BLOCK", block), ("GROUP", group), ("ALONE", group), ("SHAPES", 1), ("PLANES", 0), ("WORTH_WORKERS", 0)):
         monkeypatch.setattr(walk, name, value)
     with threads(1):
         got = run()
@@ -157,6 +157,9 @@ def test_running_sums_and_products(count: int) -> None:
     out = torch.empty_like(x)
     blocks.Scan(x, out).run(torch.add, start)
     assert_close(out, x.cumsum(1) + start[:, None], 1e-14)
+    total = torch.empty_like(x)
+    blocks.Scan(x, total, blocks.Scan(total, total)).run(torch.add, start)
+    assert_same_bits([total], [out])
     want = x.cumprod(1) * start[:, None]
     blocks.Scan(x, x).run(torch.mul, start)
     assert_close(x, want, 1e-14)

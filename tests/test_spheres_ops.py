@@ -83,7 +83,7 @@ def test_working_memory_does_not_grow_with_the_pairs_of_pixels_and_spheres(monke
 
 def test_threads_change_no_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     """With workers."""
-    for name, value in (("GROUP", 512), ("ALONE", 512), ("WORTH_WORKERS", 0)):
+    for name, value in (("GROUP", 512), ("ALONE", 512), ("PLANES", 0), ("WORTH_WORKERS", 0)):
         monkeypatch.setattr(walk, name, value)
     s, camera = scenes.spheres(3000, size=(0.05, 0.3)), scenes.camera(2, 130, 90)
     results = []

@@ -49,11 +49,8 @@ def workers(worth: bool = True) -> Iterator[OrderedMap]:
         yield _plain_map
         return
     pool = _pool(threads)
-    torch.set_num_threads(1)
-    try:
+    with single_threaded():
         yield functools.partial(_pool_map, pool, threads)
-    finally:
-        torch.set_num_threads(threads)
 
 
 def map_chunks(function: Callable[[slice], R], n: int, size: int) -> list[R]:
@@ -95,23 +92,35 @@ def _call(function: Callable[[T], R], item: T) -> R:
         return function(item)
 
 
-def _single_threaded() -> None:
-    torch.get_num_threads()             # a thread's first look takes over the process's setting, so it comes before its own setting
-    torch.set_num_threads(1)
-
-
-def single_threaded_pool(threads: int, name: str) -> ThreadPoolExecutor:
-    """Threads in which torch's operations are single-threaded: for what is beside the work that all cores are for.
+@contextlib.contextmanager
+def single_threaded() -> Iterator[None]:
+    """The calling thread's operations are single-threaded: where another thread has the work that all cores are for.
 
     Each thread with parallel operations has OpenMP threads of its own, as long as it lives. If there are more of these than cores, OpenMP (GNU's)
     no longer lets them spin while they wait for each other, but sleep: everything in the process takes up to twice as long.
     """
+    before = _take_one_thread()
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _take_one_thread() -> int:
+    """For this thread, and those yet to come; returns how many it was."""
+    before = torch.get_num_threads()    # a thread's first look takes over the process's setting, so it comes before its own setting
+    torch.set_num_threads(1)
+    return before
+
+
+def single_threaded_pool(threads: int, name: str) -> ThreadPoolExecutor:
+    """Threads whose operations are single-threaded; see `single_threaded`."""
     others = torch.get_num_threads()
-    pool = ThreadPoolExecutor(threads, name, initializer=_single_threaded)
+    pool = ThreadPoolExecutor(threads, name, initializer=_take_one_thread)
     started = threading.Barrier(threads)
     for future in [pool.submit(started.wait) for _ in range(threads)]:
         future.result()
-    torch.set_num_threads(others)                       # the setting is each thread's own, except for threads yet to come
+    torch.set_num_threads(others)                       # that of threads yet to come
     return pool
 
 

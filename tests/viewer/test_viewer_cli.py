@@ -63,6 +63,30 @@ def test_view_says_where_serves_the_page_and_ends_by_ctrl_c(options: list[str], 
 
 
 @needs_viser
+def test_the_cores_are_left_to_the_thread_that_draws(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """See `tsplat_reference.parallel.single_threaded`: 100,000 splats took twice as long after the main thread had used both."""
+    threads: list[int] = []
+
+    def load(path: str) -> Gaussians:
+        threads.append(torch.get_num_threads())
+        return Gaussians.load(path)
+
+    def look(*_: object) -> None:
+        threads.append(torch.get_num_threads())
+        raise ValueError("scene: seen enough")
+
+    monkeypatch.setattr("tsplat.cli.view.load_scene", load)
+    monkeypatch.setattr("tsplat.cli.view.draw_view", look)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        assert run("view", scene, "--port", 0) == 2
+        assert (threads, torch.get_num_threads()) == ([1, 1], 2)
+    finally:
+        torch.set_num_threads(before)
+
+
+@needs_viser
 @pytest.mark.parametrize(("options", "message"), [
     (["--port", "65536"], "port: expected 0 (any) to 65535; got 65536"),
     (["--port", "0", "--host", "203.0.113.1"], "host, port: cannot listen at 203.0.113.1, port 0: "),

@@ -2,8 +2,10 @@
 
 import threading
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
+import torch
 
 import tsplat.viewer.loop
 from tsplat.scene import Gaussians, Spheres
@@ -84,6 +86,31 @@ def test_a_picture_that_fails_does_not_end_the_others(loop: RenderLoop, gaussian
     assert not eye.frames
     loop.wish(eye.visitor, wish(1.0))
     wait(eye.sharp(wish(1.0)), "a picture after the failures")
+
+
+@pytest.mark.parametrize("one_core", [False, True])
+def test_only_one_thread_draws_on_all_cores(one_core: bool, gaussians: Gaussians, wait: Wait, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second one would make both slower: each takes OpenMP threads of its own. None does beside a fit."""
+    cores, drawn = 2, []
+
+    def draw(*args: Any) -> Any:
+        drawn.append((threading.current_thread().name, torch.get_num_threads()))
+        return draw_view(*args)
+
+    monkeypatch.setattr(tsplat.viewer.loop, "draw_view", draw)
+    before = torch.get_num_threads()
+    torch.set_num_threads(cores)
+    try:
+        with RenderLoop(one_core=one_core) as loop:
+            loop.show(gaussians)
+            eye = Eye(loop)
+            loop.wish(eye.visitor, wish())
+            wait(eye.sharp(wish()), "the sharp picture")
+            loop.sharp(wish())
+        assert torch.get_num_threads() == cores
+    finally:
+        torch.set_num_threads(before)
+    assert set(drawn) == {("viewer", 1 if one_core else cores), (threading.current_thread().name, 1)}
 
 
 def test_the_thread_ends(gaussians: Gaussians) -> None:

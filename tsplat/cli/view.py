@@ -5,6 +5,8 @@ from __future__ import annotations
 import argparse
 import time
 
+from tsplat_reference.parallel import single_threaded
+
 from tsplat.cli.common import AXES, SCENE, add_device, device_of
 from tsplat.scene import Spheres, load_capture, load_scene
 from tsplat.viewer import RenderLoop, Settings, Views, draw_view
@@ -44,13 +46,14 @@ def run(options: argparse.Namespace) -> None:
     """Run the command."""
     from tsplat.viewer.page import Page
 
-    scene = load_scene(options.scene).to(device_of(options.device))
-    if options.data is None:
-        views = Views.of_scene(scene, AXES[options.up or UP])
-    else:
-        views = Views.of_capture(load_capture(options.data, test_every=0), None if options.up is None else AXES[options.up])
     settings = Settings(background=BACKGROUNDS[options.background], antialiased=options.antialiased)
-    draw_view(scene, views.start.resized(8, 8), settings)                        # what cannot be drawn at all is an error here
+    with single_threaded():                                                         # the cores are for the loop's thread
+        scene = load_scene(options.scene).to(device_of(options.device))
+        if options.data is None:
+            views = Views.of_scene(scene, AXES[options.up or UP])
+        else:
+            views = Views.of_capture(load_capture(options.data, test_every=0), None if options.up is None else AXES[options.up])
+        draw_view(scene, views.start.resized(8, 8), settings)                       # what cannot be drawn at all is an error here
     with RenderLoop() as loop, Page(loop, views, settings, None if isinstance(scene, Spheres) else scene.sh_degree,
                                     host=options.host, port=options.port) as page:
         loop.show(scene)

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import threading
 import time
 import traceback
 from collections.abc import Callable
 from types import TracebackType
+
+from tsplat_reference.parallel import single_threaded
 
 from tsplat.pictures.modes import Scene
 from tsplat.viewer.schedule import Frame, Job, Schedule, Visitor, Wish
@@ -17,9 +20,13 @@ class RenderLoop:
     """Draws a scene for any number of visitors, as `Schedule` says.
 
     The methods may be called from any thread. A context manager: at the end of the block the thread ends.
+
+    Args:
+        one_core: whether the rest of a CPU is for something else, a fit (see `tsplat_reference.parallel.single_threaded`).
     """
 
-    def __init__(self) -> None:
+    def __init__(self, *, one_core: bool = False) -> None:
+        self._one_core = one_core
         self._schedule = Schedule()
         self._scene: Scene | None = None
         self._changed = threading.Condition()
@@ -74,7 +81,8 @@ class RenderLoop:
 
     def sharp(self, wish: Wish) -> Pixels | None:
         """The picture of a wish at its full resolution, drawn by the calling thread; None as long as there is no scene."""
-        return None if self._scene is None else draw_view(self._scene, wish.viewpoint.camera(), wish.settings)
+        with single_threaded():                       # beside the thread of the loop
+            return None if self._scene is None else draw_view(self._scene, wish.viewpoint.camera(), wish.settings)
 
     def close(self) -> None:
         """End the thread, after the picture at which it is."""
@@ -90,6 +98,10 @@ class RenderLoop:
         self.close()
 
     def _run(self) -> None:
+        with single_threaded() if self._one_core else contextlib.nullcontext():
+            self._draw()
+
+    def _draw(self) -> None:
         while (work := self._next()) is not None:
             job, scene = work
             begin = time.perf_counter()

@@ -126,8 +126,8 @@ def training_page(capture: Capture, config: FitConfig, *, host: str = "127.0.0.1
     """
     red, green, blue = fixed_background(config).tolist()
     settings = Settings(background=(red, green, blue), antialiased=config.antialiased)
-    with RenderLoop() as loop, Page(loop, Views.of_capture(capture), settings, None if config.primitive == "spheres" else config.sh_degree,
-                                    host=host, port=port) as page:
+    degree = None if config.primitive == "spheres" else config.sh_degree
+    with RenderLoop(one_core=True) as loop, Page(loop, Views.of_capture(capture), settings, degree, host=host, port=port) as page:
         training = TrainingView(loop, config.steps)
         page.add_training(training)
         yield page, training

@@ -206,7 +206,7 @@ def test_a_second_launch_goes_to_the_binary_of_the_first(compiler: Compiler) -> 
     kernel[(5,)](other, None, 9, 1, D=4, num_warps=2)
     kernel[(5,)](other, None, 9, 0.25, D=4, num_warps=2)
     assert [who for who, _ in compiler.launches] == ["triton", "triton", "binary"]       # an int for a float is another key
-    assert compiler.launches[2][1] == (5, 1, 1, "stream", "function", "metadata", None, None, None, other, None, 9, 0.25, 4)
+    assert compiler.launches[2][1] == (5, 1, 1, "stream", "function", "metadata", None, None, None, other.data_ptr(), None, 9, 0.25, 4)
 
 
 @pytest.mark.parametrize("change", [{"x": torch.zeros(8, dtype=torch.float64)}, {"x": torch.zeros(8)[1:]}, {"y": torch.zeros(8)}, {"N": 2**31},

@@ -98,7 +98,10 @@ def count_hits(mx, my, s, reach, shrink, half, rightmost, real, W, H, TILE: tl.c
 @triton.jit(do_not_specialize=["R", "W", "H"])
 def count_kernel(radii, means2d, conics, opacities, counts, totals, R, W, H, EPS: tl.constexpr, TILE: tl.constexpr, SIDE: tl.constexpr,
                  BLOCK: tl.constexpr):
-    """Number of bins that each splat hits, counts `[R]`, and of bins and of tiles that all do, added to totals `[2]`."""
+    """Number of bins that each splat hits, counts `[R]`, and of bins and of tiles that all do, added to totals `[2]`.
+
+    All these are int64, so that torch's running sums need no copy of another type.
+    """
     i = tl.program_id(0).to(tl.int64) * BLOCK + tl.arange(0, BLOCK)
     real = visible(radii, i, i < R)
     mx, my, s, reach, shrink, half, rightmost = ellipse(means2d, conics, opacities, i, real, W, H, EPS)
@@ -111,7 +114,7 @@ def count_kernel(radii, means2d, conics, opacities, counts, totals, R, W, H, EPS
 
 @Launcher
 @triton.jit(do_not_specialize=["R", "N", "W", "H", "bins_x", "bins_y", "capacity"])
-def emit_kernel(radii, means2d, conics, opacities, depth_keys, counts, ends, keys, ids, R, N, W, H, bins_x, bins_y, capacity,
+def emit_kernel(radii, means2d, conics, opacities, depth_keys, ends, keys, ids, R, N, W, H, bins_x, bins_y, capacity,
                 EPS: tl.constexpr, TILE: tl.constexpr, SIDE: tl.constexpr, BLOCK: tl.constexpr):
     """Key and splat of each hit of bins, splat after splat; hits beyond the capacity are not written. A key is the bin, then the depth: the
     bits of a float, made to sort as an integer."""
@@ -119,7 +122,7 @@ def emit_kernel(radii, means2d, conics, opacities, depth_keys, counts, ends, key
     real = visible(radii, i, i < R)
     mx, my, s, reach, shrink, half, rightmost = ellipse(means2d, conics, opacities, i, real, W, H, EPS)
     row, last = rows(my, half, real, H, TILE * SIDE)
-    at = tl.load(ends + i, mask=i < R, other=0) - tl.load(counts + i, mask=i < R, other=0)
+    at = tl.load(ends + i - 1, mask=(i > 0) & (i < R), other=0)
     bits = tl.load(depth_keys + i, mask=real, other=0)
     bits = tl.where(bits == -2147483648, 0, bits)       # -0.0
     depth = (bits ^ ((bits >> 31) & 0x7fffffff)).to(tl.int64) + 2147483648
@@ -169,10 +172,10 @@ def mask_kernel(keys, by_key, ids, means2d, conics, opacities, edges, sorted_ids
 
 @Launcher
 @triton.jit(do_not_specialize=["M", "bins_x", "bins_y", "tiles_x", "tiles_y", "capacity"])
-def pick_kernel(edges, sorted_ids, masks, offsets, counts, ids, M, bins_x, bins_y, tiles_x, tiles_y, capacity, WRITE: tl.constexpr,
+def pick_kernel(edges, sorted_ids, masks, offsets, ids, M, bins_x, bins_y, tiles_x, tiles_y, capacity, WRITE: tl.constexpr,
                 SIDE: tl.constexpr, BLOCK: tl.constexpr):
-    """A program per bin and row of tiles in it. The numbers of their splats, after a first 0: counts `[tiles + 1]`; or (WRITE) the splats
-    themselves, in the order of the bin's list.
+    """A program per bin and row of tiles in it. The numbers of their splats, after a first 0, to offsets `[tiles + 1]`; or (WRITE), with
+    offsets their running sum, the splats themselves, in the order of the bin's list.
 
     The 8 tiles are counted in the 8 bytes of one integer, whose running sum is the rank of each hit in its tile; BLOCK is below 256.
     """
@@ -198,8 +201,8 @@ def pick_kernel(edges, sorted_ids, masks, offsets, counts, ids, M, bins_x, bins_
         at += (tl.sum(ones, 0, keep_dims=True) >> (8 * t)) & 255
         i += BLOCK
     if not WRITE:
-        tl.store(counts + 1 + tile, at.to(tl.int32), mask=inside)
-        tl.store(counts + tile, tl.zeros_like(tile).to(tl.int32), mask=tile == 0)
+        tl.store(offsets + 1 + tile, at, mask=inside)
+        tl.store(offsets + tile, tl.zeros_like(tile), mask=tile == 0)
 
 
 def bin_splats(means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, depths: Tensor, width: int, height: int, tile: int
@@ -235,23 +238,23 @@ class _Splats:
         self.radii = radii.contiguous()
         self.options = {"EPS": torch.finfo(means2d.dtype).eps, "TILE": tile, "SIDE": SIDE.value, **launch("bin")}
         self.programs = ceil_div(self.R, self.options["BLOCK"])
-        self.counts = torch.empty(self.R, dtype=torch.int32, device=means2d.device)
+        ends = torch.empty(self.R, dtype=torch.int64, device=means2d.device)     # more than 2^31 hits are counted right
         self.totals = torch.zeros(2, dtype=torch.int64, device=means2d.device)
         if self.R:
-            count_kernel[(self.programs,)](self.radii, *self.shapes, self.counts, self.totals, self.R, *self.size, **self.options)
-        self.ends = self.counts.cumsum(0)                                       # int64: more than 2^31 hits are counted right
+            count_kernel[(self.programs,)](self.radii, *self.shapes, ends, self.totals, self.R, *self.size, **self.options)
+        self.ends = ends.cumsum_(0)
 
     def lists(self, depths: Tensor, coarse: int, fine: int) -> tuple[Tensor, Tensor]:
         """Ids and offsets, with room for so many hits of bins and of tiles; hits beyond are left out."""
-        device, bins = self.counts.device, self.C * self.bins[0] * self.bins[1]
-        tile_counts = torch.empty(self.C * self.tiles[0] * self.tiles[1] + 1, dtype=torch.int32, device=device)
+        device, bins = self.ends.device, self.C * self.bins[0] * self.bins[1]
+        offsets = torch.empty(self.C * self.tiles[0] * self.tiles[1] + 1, dtype=torch.int64, device=device)
         # zeros, as deterministic blending reads ids beyond the last offset, which there are in a fixed capacity
         ids = torch.zeros(fine, dtype=torch.int32, device=device)
         if not (self.R and coarse):
-            return ids, tile_counts.zero_().to(torch.int64)
+            return ids, offsets.zero_()
         keys = torch.full((coarse,), bins << 32, dtype=torch.int64, device=device)      # what is not overwritten is room beyond the hits
         unsorted = torch.empty(coarse, dtype=torch.int32, device=device)
-        emit_kernel[(self.programs,)](self.radii, *self.shapes, _depth_keys(depths), self.counts, self.ends, keys, unsorted, self.R, self.N,
+        emit_kernel[(self.programs,)](self.radii, *self.shapes, _depth_keys(depths), self.ends, keys, unsorted, self.R, self.N,
                                       *self.size, *self.bins, coarse, **self.options)
         keys, by_key = keys.sort(stable=True)
         edges = torch.empty(bins + 1, dtype=torch.int64, device=device)
@@ -261,9 +264,9 @@ class _Splats:
         del unsorted, by_key, keys
         grid, options = (bins, SIDE.value), {"SIDE": SIDE.value, **launch("pick")}
         lists = edges, sorted_ids, masks
-        pick_kernel[grid](*lists, tile_counts, tile_counts, ids, coarse, *self.bins, *self.tiles, fine, WRITE=False, **options)
-        offsets = tile_counts.cumsum(0)
-        pick_kernel[grid](*lists, offsets, tile_counts, ids, coarse, *self.bins, *self.tiles, fine, WRITE=True, **options)
+        pick_kernel[grid](*lists, offsets, ids, coarse, *self.bins, *self.tiles, fine, WRITE=False, **options)
+        offsets.cumsum_(0)
+        pick_kernel[grid](*lists, offsets, ids, coarse, *self.bins, *self.tiles, fine, WRITE=True, **options)
         return ids, offsets
 
 

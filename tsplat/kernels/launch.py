@@ -28,7 +28,8 @@ class Target:
         return "nvidia" if self.ptx else "cdna" if self.lanes == 64 else "rdna"
 
 
-INTERPRETED = bool(triton.knobs.runtime.interpret)
+_RUNTIME = triton.knobs.runtime
+INTERPRETED = bool(_RUNTIME.interpret)
 """Whether kernels run in the interpreter: settled, as in `triton.jit`, on import."""
 
 
@@ -68,12 +69,15 @@ class Launcher:
     def _launch(self, grid: tuple[int, ...], *args: Any, **constants: Any) -> None:
         driver = triton.runtime.driver.active
         device = driver.get_current_device()
-        kinds = [(a.dtype, a.data_ptr() % 16) if isinstance(a, Tensor) else -2**31 <= a < 2**31 if type(a) is int else type(a) for a in args]
+        # addresses, not tensors: the driver is not asked about each of them (it is a kernel of ours, so they are on the device)
+        passed = [a.data_ptr() if isinstance(a, Tensor) else a for a in args]
+        kinds = [(a.dtype, p % 16) if isinstance(a, Tensor) else -2**31 <= a < 2**31 if type(a) is int else type(a)
+                 for a, p in zip(args, passed, strict=True)]
         key = (device, *kinds, *constants, *constants.values())
         found = self.binaries.get(key)
         if found is not None and not _hooked():
             run, function, metadata, values, _ = found
-            run(*grid, *(1,) * (3 - len(grid)), driver.get_current_stream(device), function, metadata, None, None, None, *args, *values)
+            run(*grid, *(1,) * (3 - len(grid)), driver.get_current_stream(device), function, metadata, None, None, None, *passed, *values)
             return
         binary = self.kernel[grid](*args, **constants)
         if isinstance(binary, CompiledKernel) and self._known_by_key(args, constants):
@@ -91,8 +95,8 @@ class Launcher:
 
 def _hooked() -> bool:
     """Whether a profiler wants to hear of launches."""
-    runtime = triton.knobs.runtime
-    return any(getattr(hook, "calls", hook) for hook in (runtime.launch_enter_hook, runtime.launch_exit_hook))
+    enter, exit = _RUNTIME.launch_enter_hook, _RUNTIME.launch_exit_hook
+    return bool(getattr(enter, "calls", enter) or getattr(exit, "calls", exit))
 
 
 def ceil_div(a: int, b: int) -> int:

@@ -93,8 +93,9 @@ def test_commands_that_fit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     commands = [line.split("tsplat ", 1)[1] for code in section("Two commands", "sh") for line in code.splitlines() if "tsplat fit" in line]
     assert len(commands) == 2
     for command in commands:
-        assert main([*shlex.split(command), "--steps", "2", "--splats", "100", "--fresh"]) == 0, command
-        assert Path("out/contact.png").exists()
+        assert main([*shlex.split(command), "--steps", "2", "--splats", "100"]) == 0, command
+    assert Path("out/contact.png").exists()
+    assert Path("fitted/contact.png").exists()
 
 
 def test_spheres() -> None:

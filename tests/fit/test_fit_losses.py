@@ -39,6 +39,17 @@ def test_ssim_is_the_formula(size: tuple[int, int]) -> None:
     torch.testing.assert_close(ssim_map(a, a), torch.ones(*size, 3), atol=1e-4, rtol=0)
 
 
+def test_ssim_is_kornias() -> None:
+    """Away from the border, where we take zeros to be and kornia mirrors the image."""
+    from kornia.metrics import ssim
+
+    a, b = torch.rand(2, 32, 27, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    b = 0.5 * (a + b)
+    inside = slice(5, -5)
+    theirs = ssim(a.permute(2, 0, 1)[None], b.permute(2, 0, 1)[None], 11, eps=0.0)[0].permute(1, 2, 0)
+    torch.testing.assert_close(ssim_map(a, b)[inside, inside], theirs[inside, inside], rtol=1e-7, atol=1e-7)
+
+
 def test_loss_is_the_weighted_sum() -> None:
     a, b = images(16, 20)
     l1, dissimilarity = float((a - b).abs().mean()), float(1 - plain_ssim(a, b).mean())

@@ -61,9 +61,9 @@ def restore(path: Path, saved: dict[str, Any], config: FitConfig, capture: Captu
         ours, theirs = getattr(config, item.name), saved["config"].get(item.name)
         if item.metadata["decides"] and ours != theirs:
             raise ValueError(f"{path}: made with {item.name} = {theirs!r}; expected {ours!r} as now asked for. "
-                             "Ask for what it was made with, start afresh (resume=False), or choose another folder")
+                             "Ask for what it was made with, start afresh (--fresh, or resume=False), or choose another folder")
     if saved["photos"] != _photos(capture):
-        raise ValueError(f"{path}: made from other photos, or ones of another size; start afresh (resume=False), or choose "
+        raise ValueError(f"{path}: made from other photos, or ones of another size; start afresh (--fresh, or resume=False), or choose "
                          "another folder")
     return FitState.from_state_dict(load_rows(path, saved, ranks), capture, config, device, ranks)
 

@@ -220,7 +220,8 @@ def test_a_ray_through_a_centre_and_opacity_zero_have_finite_gradients(channels:
         arguments = c.backward(reference.SphereImages(*(x.detach() for x in want)))
         v_want = torch.autograd.grad(want[:3], inputs, arguments[11:14])
         v_got = [g.cpu() for g in kernels.blend_spheres_backward(*put(arguments))]
-        assert_close(v_got, v_want, 1e-12)
+        assert_close(v_got[:5] + v_got[6:], v_want[:5] + v_want[6:], 1e-12)
+        assert abs(float(v_got[5] - v_want[5])) <= 1e-12 * max(1.0, abs(float(v_want[5])))      # with opacity 0 a sum that vanishes
 
 
 def test_float32_is_as_close_as_its_rounding() -> None:

@@ -162,6 +162,26 @@ def test_float32_against_float64() -> None:
     assert float(off.max()) < 1e-3
 
 
+@pytest.mark.parametrize("gamma", [1e-3, 1e-4, 1e-5])
+def test_small_gamma_in_float32(backend: Backend, gamma: float) -> None:
+    """Where nothing is hit, alpha is 0 to the bit. Of gamma's gradient, what is relative to a pixel's sum is rounded: per pixel some eps times the
+    image's gradient, over gamma (and a logit by eps/gamma). With absolute logarithms, which are 1/gamma, it was 1e5 times that."""
+    s, camera = scenes.spheres(20), scenes.camera(None, 13, 11)
+    v = scenes.normal(11, 13, 4, seed=scenes.generator(1))
+    gradients, alphas = [], []
+    for dtype in (torch.float64, torch.float32):
+        p, f, R, o = (x.to(backend.device, dtype) for x in s)
+        g = torch.tensor(gamma, dtype=dtype, device=backend.device, requires_grad=True)
+        r = tsplat.render_spheres(p, f, R, camera.to(backend.device, dtype), opacities=o, gamma=g, near=NEAR, far=FAR, background_depth=0.3)
+        loss = (torch.cat([r.image, r.alpha[..., None]], -1) * v.to(backend.device, dtype)).sum()
+        gradients.append(float(torch.autograd.grad(loss, g)[0]))
+        alphas.append(r.alpha.detach().double())
+    assert bool((alphas[1][alphas[0] == 0] == 0).all())
+    assert bool((alphas[0] == 0).any())
+    assert float((alphas[1] - alphas[0]).abs().max()) < 1e-3 + 6e-8 / gamma
+    assert abs(gradients[1] - gradients[0]) <= 143 * 4 * 6e-8 / gamma + 10 * 6e-8 / gamma * abs(gradients[0])
+
+
 @settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10**6), n=st.integers(0, 30), width=st.integers(1, 20), height=st.integers(1, 20))
 def test_order_batch_and_window(seed: int, n: int, width: int, height: int) -> None:

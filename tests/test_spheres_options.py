@@ -49,6 +49,22 @@ def test_an_early_end_bounds_all_that_is_left_out_together() -> None:
     assert white(2 * share) == 0.0
 
 
+@pytest.mark.parametrize("channels", [1, 5])
+@pytest.mark.parametrize("bad", [None, math.nan, math.inf])
+def test_an_early_end_is_within_its_tolerance_for_opacities_above_1(backend: Backend, channels: int, bad: float | None) -> None:
+    """Behind 64 opaque black spheres 64 white ones of opacity 2, whose terms are exp(2 z/gamma): they have all the weight. One whose opacity is no
+    number is left out."""
+    p = torch.tensor([[0.0, 0, 2], [0, 0, 3], [0, 0, 4]], dtype=torch.float64).repeat_interleave(torch.tensor([64, 64, 1]), 0)
+    f, R = (p[:, 2:] > 2).double().expand(-1, channels), torch.full((129,), 0.9, dtype=torch.float64)
+    o = torch.tensor([1.0, 2, 0 if bad is None else bad], dtype=torch.float64).repeat_interleave(torch.tensor([64, 64, 1]), 0)
+    K = torch.tensor([[1e9, 0, 0.5], [0, 1e9, 0.5], [0, 0, 1]], dtype=torch.float64)        # all rays of a tile go through the centres
+    camera = tsplat.Camera(torch.eye(4, dtype=torch.float64), K, 1, 1)
+    exact, early = (tsplat.render_spheres(*backend.put((p, f, R)), backend.put(camera), opacities=backend.put(o), gamma=0.05, near=1.0, far=5.0,
+                                          percent_allowed_difference=tolerance).image for tolerance in (0.0, 1e-2))
+    assert float(exact.min()) > 0.99
+    assert float((exact - early).abs().max()) <= 1e-2
+
+
 def test_gradient_of_an_early_end_is_that_of_what_was_rendered() -> None:
     images, (mine, rest) = early_end(scenes.spheres(1500, spread=0.5, opacity=(0.9, 1.0), size=(0.2, 0.6)), scenes.camera(2, 17, 16), 1e-2)
     counts = rest[8].diff()

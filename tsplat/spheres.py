@@ -114,22 +114,23 @@ def render_spheres(positions: Tensor, features: Tensor, radii: Tensor, camera: C
         ids = ops.nearest_hits(centers, R, Ks, *bins, n_track + tracked_only, width, height, tile, model, near, far, chord)
         if tracked_only:                                # half way to the next hit: D of a grazing ray, computed twice, is not quite the same
             last, _ = hit_weights(centers.detach(), R.detach(), o.detach(), g.detach(), Ks.detach(), centers.new_zeros(C, height, width),
-                                  ids[..., -2:], model, near, far, chord)
+                                  ids[..., -2:], model, near, far, background_depth, chord)
             cutoff, ids = last.mean(-1), ids[..., :-1].contiguous()
     images = ops.blend_spheres(centers, R, o, f, backgrounds, g, Ks, *bins, cutoff, width, height, tile, model, near, far, background_depth,
                                chord, depth is not None, percent_allowed_difference)
-    alpha = -torch.expm1(background_depth / g - images.logsumexp)
+    alpha = -torch.expm1(-images.logsumexp)
+    logsumexp = images.logsumexp + background_depth / g
     z = None
     if depth is not None:
         z = images.depth / alpha.clamp_min(1e-10) if depth == "expected" else images.depth
     hits = None
     if ids is not None:
-        hits = Hits(ids, *hit_weights(centers, R, o, g, Ks, images.logsumexp, ids, model, near, far, chord))
+        hits = Hits(ids, *hit_weights(centers, R, o, g, Ks, images.logsumexp, ids, model, near, far, background_depth, chord))
     seen = visible[..., 0] > 0
     if camera.batched:
-        return SphereRendering(images.image, alpha, z, hits, seen, images.logsumexp, needed)
+        return SphereRendering(images.image, alpha, z, hits, seen, logsumexp, needed)
     return SphereRendering(images.image.squeeze(0), alpha.squeeze(0), None if z is None else z.squeeze(0),
-                           None if hits is None else Hits(*(h.squeeze(0) for h in hits)), seen.squeeze(0), images.logsumexp.squeeze(0), needed)
+                           None if hits is None else Hits(*(h.squeeze(0) for h in hits)), seen.squeeze(0), logsumexp.squeeze(0), needed)
 
 
 def _to_camera(positions: Tensor, viewmats: Tensor) -> Tensor:

@@ -47,6 +47,7 @@ class SphereScene:
     features: Tensor        # [C N or N, D]
     shared: int             # N if all cameras share the features, else 0
     gamma: float
+    background_depth: float
     intrinsics: Tensor      # [C, 4]: 1/fx, 1/fy, cx, cy
     orthographic: bool
     near: float
@@ -61,15 +62,16 @@ class SphereScene:
 
     @staticmethod
     def of(centers: Tensor, radii: Tensor, opacities: Tensor, features: Tensor, gamma: Tensor, Ks: Tensor, ids: Tensor, starts: Tensor,
-           counts: Tensor, width: int, height: int, tile: int, model: str, near: float, far: float, chord: bool) -> SphereScene:
+           counts: Tensor, width: int, height: int, tile: int, model: str, near: float, far: float, background_depth: float, chord: bool
+           ) -> SphereScene:
         """From the arguments of `blend_spheres`."""
         C, N = centers.shape[:2]
         tiles_x, tiles_y = tile_counts(width, height, tile)
         records = torch.cat([centers, radii.expand(C, -1)[..., None], opacities.expand(C, -1)[..., None]], -1).view(C * N, 5)
         fx, fy, cx, cy = split_intrinsics(Ks)
         return SphereScene(TileLists(ids, starts, counts, (C, tiles_y, tiles_x), tile), records, features.reshape(-1, features.shape[-1]),
-                           N if len(features) < C else 0, float(gamma), torch.cat([1 / fx, 1 / fy, cx, cy], 1), model == "orthographic", near,
-                           far, chord and model == "pinhole", footprint.monomials(tile, centers.dtype, centers.device))
+                           N if len(features) < C else 0, float(gamma), background_depth, torch.cat([1 / fx, 1 / fy, cx, cy], 1),
+                           model == "orthographic", near, far, chord and model == "pinhole", footprint.monomials(tile, centers.dtype, centers.device))
 
     def group(self, chunk: Chunk) -> SphereGroup:
         """Geometry of the spheres and the rays of a chunk."""
@@ -83,7 +85,7 @@ class SphereScene:
         features = self.features.index_select(0, rows).view(*shape, -1)
         x, y, z, R, o = record
         k1 = o * (self.slope * LOG2_E)
-        k0 = o * (LOG2_E * (1 + self.near / (self.far - self.near)) / self.gamma)
+        k0 = (o * (1 + self.near / (self.far - self.near)) - self.background_depth) * (LOG2_E / self.gamma)
         if self.orthographic:
             mono2, mono1, distance = self.monomials, self.monomials[:3], z
             beyond = bool((z - R).amin() < self.near) or bool(z.amax() > self.far)
@@ -186,7 +188,7 @@ class SphereGroup(NamedTuple):
     mono2: Tensor           # [G, 6, P], over |m|^2, or [6, P]
     mono1: Tensor           # [G, 3, P], over |m|, or [3, P]
     distance: Tensor        # [G, K], of the centre
-    k0: Tensor              # [G, K]: log2(e) o z/gamma = k0 + k1 D (exp2 takes 0.4 times as long as exp)
+    k0: Tensor              # [G, K]: log2(e) (o z - eps)/gamma = k0 + k1 D (exp2 takes 0.4 times as long as exp)
     k1: Tensor
     beyond: bool            # whether some hit may be out of the range of depths
 
@@ -228,28 +230,30 @@ def blend_sphere_blocks(centers: Tensor, radii: Tensor, opacities: Tensor, featu
     """As `blend_spheres`, without autograd. Working memory beyond inputs and outputs: some numbers per pixel and channel, and constants.
 
     A tile ends when the weights of all spheres that are left together are at most `tolerance` at each of its pixels: from the n spheres
-    left, of which none is nearer than that which comes next, n exp(z/gamma) is the most, as opacities are at most 1.
+    left, of which none is nearer than that which comes next, n o exp(o z/gamma) is the most, with o the largest opacity, at least 1. All terms
+    are relative to that of the background.
     """
     scene = SphereScene.of(centers, radii, opacities, features, gamma, Ks, ids, offsets[:-1], offsets.diff(), width, height, tile, model, near,
-                           far, chord)
+                           far, background_depth, chord)
     lists, D = scene.lists, features.shape[-1]
     pixels, tiles = tile * tile, len(lists.counts)
-    rest = background_depth / scene.gamma * LOG2_E
-    peak, total = centers.new_full((tiles, pixels), rest), centers.new_ones(tiles, pixels)
+    peak, total = centers.new_zeros(tiles, pixels), centers.new_ones(tiles, pixels)
     background = backgrounds.repeat_interleave(lists.shape[1] * lists.shape[2], 0)[..., None]
     image = torch.cat([background.expand(-1, -1, pixels), centers.new_zeros(tiles, int(depth), pixels)], 1)
     used = lists.counts.clone()
     memory = Memory(centers, pixels, D + 1, 5, arrays)
     nearest = scene.records[:, 2] if scene.orthographic else torch.linalg.vector_norm(scene.records[:, :3], dim=1)
     nearest = nearest - scene.records[:, 3]
+    largest = max(1.0, float(opacities.max())) if opacities.numel() else 1.0
+    ends = tolerance > 0 and bool((opacities < torch.inf).all())                            # else there is no largest
 
     def alive(some: Tensor, begin: int) -> Tensor | None:
-        if tolerance <= 0:
+        if not ends:
             return None
         counts = lists.counts[some]
         first = ids[(lists.starts[some] + begin).clamp_(max=len(ids) - 1)].long()
         z = 1 - ((nearest[first] - near) / (far - near)).clamp_(0, 1)
-        left = (counts - begin).clamp(min=1).log2() + z * (LOG2_E / scene.gamma)
+        left = (counts - begin).clamp(min=1).log2() + math.log2(largest) + (largest * z - background_depth) * (LOG2_E / scene.gamma)
         live = left > math.log2(tolerance) + (peak[some] + total[some].log2()).amin(1)
         used[some[(counts > begin) & ~live]] = begin                                        # no other group has these tiles
         return live
@@ -275,7 +279,7 @@ def blend_sphere_blocks(centers: Tensor, radii: Tensor, opacities: Tensor, featu
             full.index_copy_(0, chunk.tiles, mine)
         return chunk
 
-    for _ in lists.run(blend, alive, D + 1, grow=tolerance <= 0):      # an end that does not depend on what else is rendered
+    for _ in lists.run(blend, alive, D + 1, grow=not ends):      # an end that does not depend on what else is rendered
         pass
     image = torch.cat([image / total[:, None], (peak + total.log2())[:, None] / LOG2_E], 1)
     color, z, logsumexp = (to_image(x, lists.shape, width, height) for x in (image[:, :D], image[:, D:D + 1], image[:, -1:]))
@@ -291,12 +295,19 @@ def softmax_gradient(images: SphereImages, v_image: Tensor, v_depth: Tensor | No
     return common if v_logsumexp is None else common + v_logsumexp
 
 
-def background_gradients(backgrounds: Tensor, gamma: Tensor, logsumexp: Tensor, v_image: Tensor, common: Tensor, background_depth: float
-                         ) -> tuple[Tensor, Tensor]:
-    """Gradients of the backgrounds, and of gamma by way of the background's term exp(eps/gamma); `common` is `softmax_gradient`."""
-    weight = (background_depth / gamma - logsumexp).exp()
-    v_backgrounds = (v_image * weight[..., None]).sum((1, 2))
-    return v_backgrounds, -background_depth / gamma**2 * ((v_backgrounds * backgrounds).sum() + (weight * common).sum())
+def background_gradients(backgrounds: Tensor, gamma: Tensor, logsumexp: Tensor, v_image: Tensor, v_logsumexp: Tensor | None, common: Tensor,
+                         background_depth: float, cut: bool) -> tuple[Tensor, Tensor]:
+    """Gradients of the backgrounds, and what is left of that of gamma without the spheres'; `common` is `softmax_gradient`.
+
+    That of gamma is -1/gamma times the sum over the terms of derivative by the term's logarithm, times that logarithm. These are up to 1/gamma,
+    and the derivatives are as large with either sign: they add up to `v_logsumexp`. So all logarithms are taken relative to that of the sum, and
+    nothing large cancels. But if hits are `cut`, for which there is no such sum, as they are.
+    """
+    weight = (-logsumexp).exp()
+    behind = (v_image * backgrounds[:, None, None]).sum(-1)
+    rest = -weight * (behind + common) if v_logsumexp is None else v_logsumexp - weight * (behind + common)
+    relative = background_depth / gamma if cut else -logsumexp
+    return (v_image * weight[..., None]).sum((1, 2)), (rest * relative).sum() / gamma
 
 
 def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tensor, features: Tensor, backgrounds: Tensor, gamma: Tensor,
@@ -314,15 +325,16 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
         intrinsics: whether the gradient of Ks is wanted; zeros if not.
     """
     scene = SphereScene.of(centers, radii, opacities, features, gamma, Ks, ids, offsets[:-1], images.used.long(), width, height, tile, model, near,
-                           far, chord)
+                           far, background_depth, chord)
     lists, (C, N), D = scene.lists, centers.shape[:2], features.shape[-1]
     common = softmax_gradient(images, v_image, v_depth, v_logsumexp)
-    v_backgrounds, v_gamma = background_gradients(backgrounds, gamma, images.logsumexp, v_image, common, background_depth)
+    v_backgrounds, v_gamma = background_gradients(backgrounds, gamma, images.logsumexp, v_image, v_logsumexp, common, background_depth,
+                                                 cutoff is not None)
     planes = [v_image, common[..., None], images.logsumexp[..., None] * LOG2_E]
     planes += [] if v_depth is None else [v_depth[..., None]]
     planes += [] if cutoff is None else [cutoff[..., None]]
     upstream = to_tiles(torch.cat(planes, -1), tile)                                        # [tiles, D + 2.., P]
-    memory = Memory(centers, tile * tile, D + 1, 7, arrays)
+    memory = Memory(centers, tile * tile, D + 1, 8, arrays)
     most = -math.log2(torch.finfo(centers.dtype).tiny)                                      # of e, where o or d is next to nothing
     least = math.sqrt(torch.finfo(centers.dtype).eps) / 2       # of s: below, a ray goes through the centre as far as its rounding tells
 
@@ -331,14 +343,15 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
         G, K = chunk.padding.shape
         ups = upstream.index_select(0, chunk.tiles)
         m2, m1, v_features = (centers.new_zeros(G, n, K) for n in (6, 3, D))
-        sums = centers.new_zeros(4, G, K)
+        sums = centers.new_zeros(5, G, K)
         v_norm2 = centers.new_empty(G, tile * tile) if intrinsics and not scene.orthographic else None
-        for rows, k, (s, h, d, depths, e, v, x) in memory.blocks(chunk):
+        for rows, k, (s, h, d, depths, e, v, x, log_e) in memory.blocks(chunk):
             g, up = group.part(rows, k), ups[rows]
             R, o = g.record[3][..., None], g.record[4][..., None]
             factor = fill_hits(scene, g, s, h, d, depths)
-            torch.addcmul(g.k0[..., None], g.k1[..., None], depths, out=e)
-            e.sub_(up[:, D + 1, None]).clamp_(max=most).exp2_().masked_fill_(d <= 0, 0.0)
+            torch.addcmul(g.k0[..., None], g.k1[..., None], depths, out=log_e)
+            torch.exp2(log_e.sub_(up[:, D + 1, None]).clamp_(max=most), out=e)
+            e.masked_fill_(d <= 0, 0.0)
             if cutoff is not None:
                 e.masked_fill_(depths > up[:, -1, None], 0.0)
             torch.mul(e, d, out=x)
@@ -351,6 +364,7 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
             torch.mul(v, d, out=x)
             torch.sum(x, 2, out=sums[0, rows, :k])
             sums[1, rows, :k] = torch.mul(x, depths).sum(2)
+            sums[4, rows, :k] = torch.mul(x, log_e).sum(2)
             v_s = (v * o).neg_()                                                            # d = 1 - s
             along = v.mul_(o * (o * scene.slope))                                           # dL/dD over d
             if v_depth is not None:
@@ -373,7 +387,7 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
             m1[rows, :, :k] = products(g.mono1, x.mT)
             if v_norm2 is not None:
                 v_norm2[rows] = -(v_t.mul_(t) + x.mul_(depths.addcmul_(h, R)).mul_(0.5)).sum(1)
-        x0, x1, v_R, v_distance = sums
+        x0, x1, v_R, v_distance, x_log = sums
         xz = (1 + near / (far - near)) * x0 - x1 / (far - near)                             # sum of x z
         if v_norm2 is not None:
             v_norm2 /= scene._norm2(group.rays)
@@ -383,7 +397,8 @@ def blend_sphere_blocks_backward(centers: Tensor, radii: Tensor, opacities: Tens
             v_geometry[:3] += group.record[:3] * (v_distance / group.distance)
         o = group.record[4]
         v_o = x0 + o * xz / scene.gamma
-        return group, torch.cat([v_geometry, v_o[None]]), v_features, -(o * o * xz).sum() / scene.gamma**2, v_K
+        v_gamma = -(o * (x_log / LOG2_E if cutoff is None else o * xz / scene.gamma)).sum() / scene.gamma     # see `background_gradients`
+        return group, torch.cat([v_geometry, v_o[None]]), v_features, v_gamma, v_K
 
     v_records, v_table = empty_sums(5, C * N, centers), empty_sums(D, len(scene.features), centers)
     v_Ks = centers.new_zeros(C, 4)

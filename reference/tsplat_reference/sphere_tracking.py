@@ -21,7 +21,7 @@ def nearest_hits(centers: Tensor, radii: Tensor, Ks: Tensor, ids: Tensor, offset
     C, N = centers.shape[:2]
     dummy = centers.new_zeros(1, N)
     scene = SphereScene.of(centers, radii, dummy, dummy[..., None], centers.new_ones(()), Ks, ids, offsets[:-1], offsets.diff(), width, height,
-                           tile, model, near, far, chord)
+                           tile, model, near, far, 0.0, chord)
     lists, pixels = scene.lists, tile * tile
     depths = centers.new_full((len(lists.counts), pixels, count), torch.inf)
     found = torch.full(depths.shape, -1, dtype=torch.int32, device=depths.device)
@@ -54,7 +54,7 @@ def nearest_hits(centers: Tensor, radii: Tensor, Ks: Tensor, ids: Tensor, offset
 
 
 def hit_weights(centers: Tensor, radii: Tensor, opacities: Tensor, gamma: Tensor, Ks: Tensor, logsumexp: Tensor, hits: Tensor, model: str,
-                near: float, far: float, chord: bool) -> tuple[Tensor, Tensor]:
+                near: float, far: float, background_depth: float, chord: bool) -> tuple[Tensor, Tensor]:
     """Distance D (infinite where there is no hit) and weight of each of the `hits` `[C, H, W, n]` of `nearest_hits`, differentiable.
 
     Args: as those of `blend_spheres`, and its logsumexp.
@@ -72,6 +72,6 @@ def hit_weights(centers: Tensor, radii: Tensor, opacities: Tensor, gamma: Tensor
     x, y, z = (take(v) for v in centers.unbind(-1))
     R, o = take(radii), take(opacities)
     _, d, D = ray_hits((column - cx) / fx, (row - cy) / fy, x, y, z, R, model, near, far, chord)
-    logit = o * (1 - (D - near) / (far - near)) / gamma - logsumexp[..., None]
+    logit = (o * (1 - (D - near) / (far - near)) - background_depth) / gamma - logsumexp[..., None]
     weights = o * d * torch.where(is_hit, logit, 0.0).exp()
     return torch.where(is_hit, D, torch.inf), torch.where(is_hit, weights, 0.0)

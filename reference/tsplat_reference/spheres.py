@@ -41,7 +41,8 @@ class Outlines(NamedTuple):
 
 class SphereImages(NamedTuple):
     """image: `[C, H, W, D]`. depth: `[C, H, W]`, sum of w_i D_i (`[C, 0, 0]` unless asked for). logsumexp: `[C, H, W]`, log of the
-    denominator of w. used: int32 `[tiles]`, so many hits of each tile's list count.
+    denominator of w over the background's term: 0 where nothing is hit, exactly, whatever gamma. used: int32 `[tiles]`, so many hits of each
+    tile's list count.
     """
 
     image: Tensor
@@ -143,7 +144,7 @@ def blend_spheres(centers: Tensor, radii: Tensor, opacities: Tensor, features: T
         F = row[..., 5:]
         image = w @ F if keep is None else (w * keep) @ F + (w * ~keep) @ F.detach()
         image = image + rest / total * backgrounds[view, None]
-        parts.append(torch.cat([image, (w * D_hit).sum(-1, keepdim=True), total.log() + peak], -1))
+        parts.append(torch.cat([image, (w * D_hit).sum(-1, keepdim=True), total.log() + (peak - background)], -1))
     full = to_image(torch.cat(parts).mT, shape, width, height)
     return SphereImages(full[..., :D], full[..., D] if depth else full.new_zeros(C, 0, 0), full[..., D + 1], counts.to(torch.int32))
 

@@ -26,6 +26,8 @@ CHANNELS = 4
 CHECK = 64
 """Spheres after which a tile may end: as in the reference, so that the same count."""
 LOG2E = tl.constexpr(math.log2(math.e))
+NO_TERM = tl.constexpr(1e30)
+"""For the logarithm of a sum, where there is no pixel: all terms are 0, relative to it."""
 NOWHERE = tl.constexpr(1e15)
 """x of the null sphere, of radius 1: no ray reaches that, and its square is a float32."""
 
@@ -98,12 +100,20 @@ def load_sphere(records, sphere, RECORD: tl.constexpr):
 
 
 @triton.jit
-def depth_slope(gamma, near, far, dt: tl.constexpr):
-    """near and far, and (p, q) with (1 - (D - near)/(far - near)) log2(e)/gamma = p - q D, and log2(e)/gamma."""
+def depth_slope(gamma, near, far, background_depth, dt: tl.constexpr):
+    """near and far, and with log2(e)/gamma for 1: (p, q), so that 1 - (D - near)/(far - near) = p - q D; the background's depth, to which
+    all logarithms of terms are relative; and 1."""
     n = tl.full((), near, dt)
     f = tl.full((), far, dt)
     scale = tl.full((), LOG2E, dt) / tl.load(gamma)
-    return n, f, scale * (1.0 + n / (f - n)), scale / (f - n), scale
+    return n, f, scale * (1.0 + n / (f - n)), scale / (f - n), tl.full((), background_depth, dt) * scale, scale
+
+
+@triton.jit
+def opacity_bound(largest):
+    """The largest opacity, at least 1; 1e30, so that no tile ends early, if that is not a number (spheres with such are left out)."""
+    most = tl.load(largest)
+    return tl.where(most >= 0, tl.minimum(tl.maximum(most, 1.0), 1e30), 1e30)
 
 
 @triton.jit
@@ -134,12 +144,13 @@ def dot(a, b, AXIS: tl.constexpr):
 
 
 @triton.jit
-def term_gradients(g, e, v_depth, t, s, h, a, D, mx, my, w, w2, x, y, z, R, r, o, distance, slope, inv_gamma, depth0, depth1,
+def term_gradients(g, e, log_e, v_depth, t, s, h, a, D, mx, my, w, w2, x, y, z, R, r, o, distance, slope, inv_gamma, depth0, depth1,
                    EPS: tl.constexpr, AXIS: tl.constexpr, ORTHO: tl.constexpr, CHORD: tl.constexpr, PTX: tl.constexpr):
     """Gradients of the centre (3), the radius, the opacity and gamma, summed over pixels; and of mx and my.
 
     The terms of the softmax are e o d with d = 1 - s, and e = exp(o z/gamma - logsumexp), 0 where missed; g: what o d e's gradient is over
-    that (`softmax_gradient`, and the features' and depth's part). slope: dlog e/dD. All is o times what is computed here from e by products
+    that (`softmax_gradient`, and the features' and depth's part). log_e: to base 2, what gamma's gradient is of (`background_gradients` of the
+    reference). slope: dlog e/dD. All is o times what is computed here from e by products
     alone, so that o = 0, d = 0 and rays through a centre are nothing special.
     """
     LEAST: tl.constexpr = EPS**0.5 / 2                  # of s: below, a ray goes through the centre as far as its rounding tells
@@ -150,7 +161,7 @@ def term_gradients(g, e, v_depth, t, s, h, a, D, mx, my, w, w2, x, y, z, R, r, o
     sum_e = total(v_e, AXIS)
     sum_ez = (depth0 * sum_e - depth1 * dot(v_e, D, AXIS)) * inv_gamma                   # z/gamma is depth0 - depth1 D, over gamma
     v_o = sum_e + o * sum_ez
-    v_gamma = -(o * o) * inv_gamma * sum_ez
+    v_gamma = -o * inv_gamma * dot(v_e, log_e, AXIS) * tl.full((), 1 / LOG2E, mx.dtype)
     along = ge * slope                                                                      # dL/dD over o d
     if v_depth is not None:
         along += e * v_depth

@@ -18,11 +18,13 @@ from tsplat.kernels.sphere_geometry import (
     CHANNELS,
     CHECK,
     LOG2E,
+    NO_TERM,
     Spheres,
     depth_slope,
     enter,
     far_off,
     load_sphere,
+    opacity_bound,
     rays,
     reciprocal,
     term,
@@ -50,8 +52,8 @@ from tsplat.kernels.tiles import (
 
 @Launcher
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null"])
-def sphere_fwd_kernel(records, ids, offsets, backgrounds, gamma, Ks, image, depths, logsumexp, used, lane_x, W, H, tiles_x, tiles_y, null,
-                      near: tl.float64, far: tl.float64, background_depth: tl.float64, tolerance: tl.float64, D: tl.constexpr,
+def sphere_fwd_kernel(records, ids, offsets, backgrounds, gamma, Ks, image, depths, logsumexp, used, lane_x, largest, W, H, tiles_x, tiles_y,
+                      null, near: tl.float64, far: tl.float64, background_depth: tl.float64, tolerance: tl.float64, D: tl.constexpr,
                       ORTHO: tl.constexpr, CHORD: tl.constexpr, DEPTH: tl.constexpr, CHECK: tl.constexpr, RECORD: tl.constexpr,
                       LANES: tl.constexpr, PTX: tl.constexpr):
     """Image `[C, H, W, D]`, depth (if DEPTH) and log-sum-exp `[C, H, W]` of a block of tiles, and how many spheres each used."""
@@ -59,9 +61,9 @@ def sphere_fwd_kernel(records, ids, offsets, backgrounds, gamma, Ks, image, dept
     dt: tl.constexpr = x.dtype
     half: tl.constexpr = TILE / 2
     mx, my, w, w2 = rays(Ks, view, x + (left.to(dt) + half), y, ORTHO)
-    n, f, level, slope, scale = depth_slope(gamma, near, far, dt)
+    n, f, level, slope, rest, scale = depth_slope(gamma, near, far, background_depth, dt)
     b = backgrounds + view * D
-    peak = x * 0.0 + tl.full((), background_depth, dt) * scale          # logarithms are to base 2
+    peak = x * 0.0                                      # logarithms are to base 2, relative to the background's term
     total = x * 0.0 + 1.0
     C0 = x * 0.0 + tl.load(b)
     C1 = x * 0.0 + tl.load(b + 1, mask=D > 1, other=0.0)
@@ -82,7 +84,7 @@ def sphere_fwd_kernel(records, ids, offsets, backgrounds, gamma, Ks, image, dept
             distance = far_off(X, Y, depth)
             _, s, _, _, distance_in = enter(mx, my, w, w2, X, Y, depth, R, reciprocal(R, PTX), distance, ORTHO, CHORD, PTX)
             hit = (s < 1.0) & (distance_in >= n) & (distance_in <= f)
-            logit = tl.where(hit, o * level - (o * slope) * distance_in, float("-inf"))
+            logit = tl.where(hit, (o * level - rest) - (o * slope) * distance_in, float("-inf"))
             # one of the two exponentials, of this term and of what was before it, both relative to the larger one, is 1
             less = tl.exp2(-tl.abs(logit - peak))
             higher = logit > peak
@@ -104,11 +106,12 @@ def sphere_fwd_kernel(records, ids, offsets, backgrounds, gamma, Ks, image, dept
         batch = following
         following = later
         if (i % CHECK == 0) & (i < longest):
-            # of the spheres that are left, at most 1 opaque, none is nearer than the next
+            # of the spheres that are left, none is nearer than the next or more opaque than the most
             first = load_sphere(records, tl.load(ids + start + i, mask=i < hits, other=null), RECORD)
             nearest = (first[2] if ORTHO else far_off(first[0], first[1], first[2])) - first[3]
             z = 1.0 - tl.minimum(tl.maximum((nearest - n) / (f - n), 0.0), 1.0)
-            bound = tl.log2(tl.maximum(hits - i, 1).to(dt)) + z * scale
+            most = opacity_bound(largest)
+            bound = tl.log2(tl.maximum(hits - i, 1).to(dt)) + tl.log2(most) + (most * z * scale - rest)
             least = tile_min(tl.min(peak + tl.log2(total), 1, keep_dims=True))
             hits = tl.where(bound > tl.log2(tl.full((), tolerance, dt)) + least, hits, tl.minimum(hits, i))
             longest = tl.max(tl.max(hits, 1), 0)
@@ -131,8 +134,8 @@ def sphere_fwd_kernel(records, ids, offsets, backgrounds, gamma, Ks, image, dept
 @Launcher
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null"])
 def sphere_bwd_kernel(records, ids, offsets, used, gamma, Ks, cutoff, logsumexp, common, v_image, v_depth, sums, v_rays, lane_x, W, H, tiles_x,
-                      tiles_y, null, near: tl.float64, far: tl.float64, D: tl.constexpr, ORTHO: tl.constexpr, CHORD: tl.constexpr,
-                      EPS: tl.constexpr, PER_HIT: tl.constexpr, RECORD: tl.constexpr, LANES: tl.constexpr, PTX: tl.constexpr):
+                      tiles_y, null, near: tl.float64, far: tl.float64, background_depth: tl.float64, D: tl.constexpr, ORTHO: tl.constexpr,
+                      CHORD: tl.constexpr, EPS: tl.constexpr, PER_HIT: tl.constexpr, RECORD: tl.constexpr, LANES: tl.constexpr, PTX: tl.constexpr):
     """Sums over the pixels, per sphere `[R + 1, SUMS]` (atomic), or per hit `[M, SUMS]` (PER_HIT, for the same bits in every run): gradients
     of the centre (3), the radius, the opacity, gamma and the features (4). v_rays (or None): `[blocks, LANES, 4]`, sums over the pixels of
     lanes of the gradients of mx and my, and of these times mx and my.
@@ -142,7 +145,7 @@ def sphere_bwd_kernel(records, ids, offsets, used, gamma, Ks, cutoff, logsumexp,
     dt: tl.constexpr = x.dtype
     half: tl.constexpr = TILE / 2
     mx, my, w, w2 = rays(Ks, view, x + (left.to(dt) + half), y, ORTHO)
-    n, f, level, slope, scale = depth_slope(gamma, near, far, dt)
+    n, f, level, slope, rest, scale = depth_slope(gamma, near, far, background_depth, dt)
     inv_gamma = 1.0 / tl.load(gamma)
     depth1 = 1.0 / (f - n)
     depth0 = 1.0 + n * depth1
@@ -151,9 +154,9 @@ def sphere_bwd_kernel(records, ids, offsets, used, gamma, Ks, cutoff, logsumexp,
     v2 = load_pixels(v_image, pixel4, column4, W, D, 2)
     v3 = load_pixels(v_image, pixel4, column4, W, D, 3)
     base = load_pixels(common, pixel4, column4, W, 1, 0)
-    # beyond the border infinite, so that all terms are 0
+    # beyond the border so large that all terms are 0
     lse = load_pixels(logsumexp, pixel4, column4, W, 1, 0) * tl.full((), LOG2E, dt)
-    lse = tl.where(glue(column4, column4 + 1) < W, lse, float("inf"))
+    lse = tl.where(glue(column4, column4 + 1) < W, lse, NO_TERM)
     none = tl.sum(x * 0.0, 1, keep_dims=True)
     v_mx = x * 0.0
     v_my = x * 0.0
@@ -183,7 +186,10 @@ def sphere_bwd_kernel(records, ids, offsets, used, gamma, Ks, cutoff, logsumexp,
             r = reciprocal(R, PTX)
             t, s, h, a, distance_in = enter(mx, my, w, w2, X, Y, depth, R, r, distance, ORTHO, CHORD, PTX)
             hit = (s < 1.0) & (distance_in >= n) & (distance_in <= last)
-            e = term(o * level - (o * slope) * distance_in - lse, hit, o)
+            logit = (o * level - rest) - (o * slope) * distance_in - lse
+            e = term(logit, hit, o)
+            if cutoff is not None:                      # as it is, and not relative to a sum that does not vanish
+                logit = o * level - (o * slope) * distance_in
             g = base + sphere[5] * v0
             if D > 1:
                 g += sphere[6] * v1
@@ -194,7 +200,7 @@ def sphere_bwd_kernel(records, ids, offsets, used, gamma, Ks, cutoff, logsumexp,
             if v_depth is not None:
                 g += distance_in * v_z
             s0, s1, s2, s3, s4, s5, pixel_mx, pixel_my = term_gradients(
-                g, e, v_z, t, s, h, a, distance_in, mx, my, w, w2, X, Y, depth, R, r, o, distance, -(o * depth1) * inv_gamma, inv_gamma,
+                g, e, logit, v_z, t, s, h, a, distance_in, mx, my, w, w2, X, Y, depth, R, r, o, distance, -(o * depth1) * inv_gamma, inv_gamma,
                 depth0, depth1, EPS, 1, ORTHO, CHORD, PTX)
             if v_rays is not None:
                 v_mx += pixel_mx
@@ -222,19 +228,21 @@ def sphere_bwd_kernel(records, ids, offsets, used, gamma, Ks, cutoff, logsumexp,
 @Launcher
 @triton.jit(do_not_specialize=["pixels", "D"])
 def upstream_kernel(image, depths, logsumexp, backgrounds, gamma, v_image, v_depth, v_logsumexp, common, partials, pixels, D,
-                    background_depth: tl.float64, DB: tl.constexpr, BLOCK: tl.constexpr):
+                    background_depth: tl.float64, CUT: tl.constexpr, DB: tl.constexpr, BLOCK: tl.constexpr):
     """What the gradients of all terms of a pixel's softmax have in common, common `[C, pixels]` (`tsplat_reference.softmax_gradient`), and
-    sums over BLOCK pixels, partials `[C, blocks, D + 1]`, of the gradients of the background and, by way of it, of gamma."""
+    sums over BLOCK pixels, partials `[C, blocks, D + 1]`, of the gradients of the background and of what is left of gamma's without the spheres'
+    (`background_gradients` of the reference)."""
     view = tl.program_id(1).to(tl.int64)
     p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
     inside = p < pixels
     at = view * pixels + p
     dt: tl.constexpr = image.dtype.element_ty
     inv_gamma = 1.0 / tl.load(gamma)
-    level = tl.full((), background_depth, dt) * inv_gamma
-    lse = tl.load(logsumexp + at, mask=inside, other=float("inf"))
-    weight = tl.exp(level - lse)                                        # of the background
-    same = weight * 0.0 if v_logsumexp is None else tl.load(v_logsumexp + at, mask=inside, other=0.0)
+    lse = tl.load(logsumexp + at, mask=inside, other=NO_TERM)
+    weight = tl.exp(-lse)                                               # of the background
+    v_lse = weight * 0.0 if v_logsumexp is None else tl.load(v_logsumexp + at, mask=inside, other=0.0)
+    relative = tl.full((), background_depth, dt) * inv_gamma if CUT else -lse
+    same = v_lse
     if v_depth is not None:
         same -= tl.load(depths + at, mask=inside, other=0.0) * tl.load(v_depth + at, mask=inside, other=0.0)
     behind = same * 0.0
@@ -250,7 +258,7 @@ def upstream_kernel(image, depths, logsumexp, backgrounds, gamma, v_image, v_dep
         tl.store(out + d, tl.sum(v * weight[:, None], 0), mask=d < D)
         begin += DB
     tl.store(common + at, same, mask=inside)
-    tl.store(out + D, -level * inv_gamma * tl.sum(weight * (same + behind), 0))
+    tl.store(out + D, inv_gamma * tl.sum((v_lse - weight * (same + behind)) * relative, 0))
 
 
 def blend_spheres_backward(centers: Tensor, radii: Tensor, opacities: Tensor, features: Tensor, backgrounds: Tensor, gamma: Tensor, Ks: Tensor,
@@ -270,13 +278,13 @@ def blend_spheres_backward(centers: Tensor, radii: Tensor, opacities: Tensor, fe
     common, programs = torch.empty_like(logsumexp), ceil_div(width * height, options["BLOCK"])
     partials = centers.new_empty(C, programs, D + 1)
     upstream_kernel[(programs, C)](image, depths, logsumexp, backgrounds, gamma, v_image, v_depth, v_logsumexp, common, partials,
-                                   width * height, D, background_depth, **options)
+                                   width * height, D, background_depth, CUT=cutoff is not None, **options)
     behind = partials.sum(1)
 
     def terms(some: slice, common: Tensor, v_depth: Tensor | None) -> list[Tensor]:
         s = Spheres(centers, radii, opacities, features[..., some], Ks, ids, offsets, width, height, tile)
         return _terms_backward(s, radii, opacities, gamma, cutoff, logsumexp, used, v_image[..., some].contiguous(), common, v_depth, width,
-                               height, model, near, far, chord, intrinsics)
+                               height, model, near, far, background_depth, chord, intrinsics)
 
     if D <= CHANNELS or not torch.are_deterministic_algorithms_enabled():
         v_features, *rest = terms(slice(None), common, v_depth)
@@ -290,7 +298,7 @@ def blend_spheres_backward(centers: Tensor, radii: Tensor, opacities: Tensor, fe
 
 def _terms_backward(s: Spheres, radii: Tensor, opacities: Tensor, gamma: Tensor, cutoff: Tensor | None, logsumexp: Tensor, used: Tensor,
                     v_image: Tensor, common: Tensor, v_depth: Tensor | None, width: int, height: int, model: str, near: float, far: float,
-                    chord: bool, intrinsics: bool) -> list[Tensor]:
+                    background_depth: float, chord: bool, intrinsics: bool) -> list[Tensor]:
     """Gradients of features, centers, radii, opacities, gamma and Ks by way of the spheres' terms."""
     deterministic = torch.are_deterministic_algorithms_enabled()
     target = current_target()
@@ -304,8 +312,8 @@ def _terms_backward(s: Spheres, radii: Tensor, opacities: Tensor, gamma: Tensor,
         v_rays = gamma.new_empty(s.C, count * target.lanes, 4) if intrinsics else None
         sphere_bwd_kernel[(s.C * count,)](
             s.records, s.ids, s.offsets, used, gamma, s.Ks, cutoff, logsumexp, common, v_image, v_depth, sums, v_rays,
-            lane_x(target.lanes, gamma), *size, near, far, D=s.D, EPS=eps, PER_HIT=deterministic, RECORD=s.record, LANES=target.lanes, **flags,
-            **launch("blend_spheres_backward"))
+            lane_x(target.lanes, gamma), *size, near, far, background_depth, D=s.D, EPS=eps, PER_HIT=deterministic, RECORD=s.record,
+            LANES=target.lanes, **flags, **launch("blend_spheres_backward"))
         if deterministic:
             sums = gamma.new_zeros(s.R + 1, SUMS.value).index_add_(0, s.ids.long(), sums)
     else:
@@ -314,12 +322,12 @@ def _terms_backward(s: Spheres, radii: Tensor, opacities: Tensor, gamma: Tensor,
         block = {"P": TILE.value**2, "PRECISION": "tf32x3" if ptx else "ieee", **flags}
         options = launch("sphere_features_backward")
         sphere_features_bwd_kernel[(s.tiles, ceil_div(s.D, options["DB"]))](
-            s.records, s.ids, s.offsets, used, gamma, s.Ks, cutoff, logsumexp, v_image, v_features, *size, rows, s.D, near, far, **block,
-            **options)
+            s.records, s.ids, s.offsets, used, gamma, s.Ks, cutoff, logsumexp, v_image, v_features, *size, rows, s.D, near, far,
+            background_depth, **block, **options)
         feature_backward = "sphere_feature_backward" if v_rays is None else "sphere_feature_cameras_backward"
         sphere_feature_bwd_kernel[(s.tiles,)](
             s.records, s.features, s.ids, s.offsets, used, gamma, s.Ks, cutoff, logsumexp, common, v_image, v_depth, sums, v_rays, *size, rows,
-            s.D, near, far, EPS=eps, **block, **launch(feature_backward))
+            s.D, near, far, background_depth, EPS=eps, **block, **launch(feature_backward))
     *gradients, v_some = s.gradients(sums[:s.R], radii, opacities)
     return [v_some if v_features is None else v_features, *gradients, sums[:s.R, 5].sum(), _intrinsics_gradient(s.Ks, v_rays)]
 
@@ -346,14 +354,15 @@ def blend_spheres(centers: Tensor, radii: Tensor, opacities: Tensor, features: T
     ptx = target.ptx and centers.dtype == torch.float32
     flags = {"ORTHO": model == "orthographic", "CHORD": chord and model == "pinhole", "DEPTH": depth,
              "CHECK": CHECK if tolerance > 0 else 1 << 30, "PTX": ptx}
+    largest = opacities.amax() if tolerance > 0 and s.R else gamma         # any pointer, if it is not read
     out, scalars = (image, depths, logsumexp, used), (near, far, background_depth, tolerance)
     if s.few:
         sphere_fwd_kernel[(s.C * blocks(s.grid, target.lanes),)](
-            s.records, s.ids, s.offsets, backgrounds.contiguous(), gamma, s.Ks, *out, lane_x(target.lanes, centers), width, height, *s.grid,
-            s.R, *scalars, D=s.D, RECORD=s.record, LANES=target.lanes, **flags, **launch("blend_spheres"))
+            s.records, s.ids, s.offsets, backgrounds.contiguous(), gamma, s.Ks, *out, lane_x(target.lanes, centers), largest, width, height,
+            *s.grid, s.R, *scalars, D=s.D, RECORD=s.record, LANES=target.lanes, **flags, **launch("blend_spheres"))
     else:
         options = launch("sphere_features")
         sphere_feature_fwd_kernel[(s.tiles, ceil_div(s.D, options["DB"]))](
-            s.records, s.features, s.ids, s.offsets, backgrounds.contiguous(), gamma, s.Ks, *out, width, height, *s.grid, s.R,
+            s.records, s.features, s.ids, s.offsets, backgrounds.contiguous(), gamma, s.Ks, *out, largest, width, height, *s.grid, s.R,
             max(len(features) * s.N, 1), s.D, *scalars, P=tile * tile, PRECISION="tf32x3" if ptx else "ieee", **flags, **options)
     return out

@@ -115,8 +115,8 @@ def launch_everything(quick: bool, deterministic_too: bool = True) -> Iterator[t
         yield "3 channels, deterministic", deterministic(lambda: blending.blend_backward(*splats, *rgb, W, H, 8, 0.99, False, False))
     geometry, tiles = (t(C, N, 3), t(1, N), t(C, 3, 3)), t(C * 80 * 60, dtype=torch.int32)
     plain, full = ("pinhole", False, False), ("pinhole", True, True)
-    variants = [(3, *plain), (32, *plain)] if quick else [(D, *plain) for D in (1, 3, 4, 32, 128)] + [(3, "orthographic", False, False),
-                                                                                                     (4, *full), (32, *full)]
+    variants = [(3, *plain), (32, *plain)] if quick else [(D, *plain) for D in (1, 3, 4, 32, 128)] + [(3, "orthographic", False, False)]
+    variants += [(4, *full), (32, *full)]               # what takes the most registers
     for D, model, chord, everything in variants:
         label = f"{D} channels{'' if model == 'pinhole' else ', ' + model}{', chord, depth, cutoff, intrinsics' if everything else ''}"
         inputs = geometry[0], geometry[1], t(1, N), t(1, N, D), t(C, D), t(), geometry[2], ids, offsets

@@ -139,15 +139,18 @@ def test_nothing_to_see(backend: Backend, case: str) -> None:
               "infinite radius": {"radii": torch.tensor([math.inf], dtype=f64)},
               "NaN opacity": {"opacities": torch.tensor([nan], dtype=f64)}, "negative opacity": {"opacities": -torch.ones(1, dtype=f64)}}
     s, camera = one_sphere(backend, **others[case])
-    mine = leaves(*s)
-    r = tsplat.render_spheres(mine[0], mine[1], mine[2], camera, opacities=mine[3], gamma=0.1, depth="expected", n_track=2, **options())
+    *mine, viewmat, K, gamma, background = leaves(*s, camera.viewmats, camera.Ks, *backend.put((torch.tensor(0.1), torch.ones(3))))
+    r = tsplat.render_spheres(mine[0], mine[1], mine[2], Camera(viewmat, K, 9, 9), opacities=mine[3], gamma=gamma, background=background,
+                              depth="expected", n_track=2, **options())
     assert torch.equal(r.image, torch.ones_like(r.image))
-    assert float(r.alpha.abs().max()) == 0
+    assert float(r.alpha.detach().abs().max()) == 0
     assert r.hits is not None
     assert bool((r.hits.ids == -1).all())
     assert not bool(r.visible.any())
-    for v in torch.autograd.grad(r.image.sum() + r.alpha.sum() + r.hits.weights.sum(), mine):
+    *zeros, v_background = torch.autograd.grad(r.image.sum() + r.alpha.sum() + r.hits.weights.sum(), [*mine, viewmat, K, gamma, background])
+    for v in zeros:
         assert torch.equal(v, torch.zeros_like(v))
+    assert torch.equal(v_background, torch.full_like(v_background, 81.0))
 
 
 def test_float32_against_float64() -> None:

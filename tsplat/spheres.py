@@ -99,12 +99,15 @@ def render_spheres(positions: Tensor, features: Tensor, radii: Tensor, camera: C
     g = gamma.to(positions) if isinstance(gamma, Tensor) else positions.new_full((), gamma)
     backgrounds = positions.new_ones(C, f.shape[-1]) if background is None else background.expand(C, -1)
 
+    # 0 for a NaN, of which the gradient by the camera's pose would be one, too
+    known = torch.linalg.vector_norm(p.detach(), 2, -1) < torch.inf
+    p = torch.where(known[..., None], p, 0.0)
     if fade_below > 0:
         keep = _fading(p.detach(), R.detach(), viewmats.detach(), Ks.detach(), model, fade_below)
         p, R = _scale_gradient(p.expand(C, -1, 3), keep[..., None]), _scale_gradient(R.expand(C, -1), keep)
     centers = _to_camera(p, viewmats)
     outline = ops.outlines(centers, R, Ks, width, height, model, near, far)
-    finite = (torch.linalg.vector_norm(f.detach(), 2, -1) < torch.inf) & (o.detach() >= 0) & (o.detach() < torch.inf)
+    finite = known & (torch.linalg.vector_norm(f.detach(), 2, -1) < torch.inf) & (o.detach() >= 0) & (o.detach() < torch.inf)
     visible = outline.radii * finite[..., None]
     to_bin = outline.means2d, visible, outline.conics, outline.opacities, outline.depths, width, height, tile
     bins, needed = (ops.bin_splats(*to_bin), None) if capacity is None else ops.bin_splats_fixed(*to_bin, capacity)

@@ -208,15 +208,15 @@ def markdown(report: dict[str, Any], figure: str | None) -> str:
     gpu, clock = report["device"] != "cpu", report["clock"]
     lines = [f"# Spheres: {report['machine']}, {report['date']}, commit {report['commit']}", "",
              f"`{report['command']}`, torch {report['torch']}, float32, {'CUDA events' if gpu else str(report['threads']) + ' threads'}, "
-             f"repetitions: {report['times']}. {BUSY if clock == 'cpu' else ''}What is measured stands at the head of `bench/spheres.py`.", "",
-             "| set-up | spheres | radius | size | tolerance | hits (M) | pairs (M) | fwd ms | bwd ms | both ms | CPU ms, fwd / bwd | goals, wall ms "
-             "| fwd M pairs/s | bwd M pairs/s | fwd MiB | fwd+bwd MiB |", "| --- " * 16 + "|"]
+             f"{BUSY if clock == 'cpu' else ''}What is measured stands at the head of `bench/spheres.py`.", "",
+             "| set-up | spheres | radius | size | tolerance | hits (M) | pairs (M) | repetitions | fwd ms | bwd ms | both ms | CPU ms, fwd / bwd "
+             "| goals, wall ms | fwd M pairs/s | bwd M pairs/s | fwd MiB | fwd+bwd MiB |", "| --- " * 17 + "|"]
     for row in report["rows"]:
         forward, backward = row["forward"], row["backward"]
         cpu = "" if gpu else f"{1e3 * forward['cpu']:.0f} / {1e3 * backward['cpu']:.0f}"
         fwd, bwd, both = (f"{1e3 * row[name]['wall']:.{2 if gpu else 0}f}" if name in row else "" for name in ("forward", "backward", "both"))
         lines.append(f"| {row['part']} | {row['spheres']:,} | {row['radius']:.4g} | {row['width']}x{row['height']} | {row['tolerance']:g} | "
-                     f"{row['hits'] / 1e6:.2f} | {row['pairs'] / 1e6:.0f} | {fwd} | {bwd} | {both} | {cpu} | {goals(row, report['device'])} | "
+                     f"{row['hits'] / 1e6:.2f} | {row['pairs'] / 1e6:.0f} | {row['times']} | {fwd} | {bwd} | {both} | {cpu} | {goals(row, report['device'])} | "
                      f"{row['pairs'] / forward[clock] / 1e6:.0f} | {row['pairs'] / backward[clock] / 1e6:.0f} | {row['forward_MiB']:.0f} | "
                      f"{row['both_MiB']:.0f} |")
     return "\n".join([*lines, *(["", f"![time over number of spheres]({figure})"] if figure else [])]) + "\n"
@@ -229,7 +229,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=torch.get_num_threads())
     size = parser.add_mutually_exclusive_group()
     size.add_argument("--quick", action="store_true", help="Table 2 with the default tolerance, and 10k and 100k spheres")
-    size.add_argument("--large", action="store_true", help="only what needs much memory, added to the JSON of an earlier run")
+    size.add_argument("--large", action="store_true", help="only what needs much memory, added to the JSON of an earlier run of this commit")
     parser.add_argument("--times", type=int, help="repetitions (default 3; 20 on a GPU; 1 with --large on a CPU)")
     parser.add_argument("--busy", action="store_true", help="the machine is busy: pairs/s and the figure are to be of CPU time (CPU only)")
     parser.add_argument("--no-figure", action="store_true", help="draw none (matplotlib is not needed then)")
@@ -254,19 +254,20 @@ def measure_all(args: argparse.Namespace) -> dict[str, Any]:
     args.out.mkdir(parents=True, exist_ok=True)
     times = args.times or (20 if args.device == "cuda" else 1 if args.large else 3)
     report = environment(args.device) | {"threads": args.threads}
-    report["times"], report["clock"] = times, "cpu" if args.busy and args.device == "cpu" else "wall"
+    report["clock"] = "cpu" if args.busy and args.device == "cpu" else "wall"
     report["rows"] = []
     name = "cpu" if args.device == "cpu" else report["machine"].removeprefix("NVIDIA ").lower().replace(" ", "-")
     stem = args.out / f"{report['date']}-spheres-{name}"
     if args.large and stem.with_suffix(".json").is_file():
         earlier = json.loads(stem.with_suffix(".json").read_text())
-        report["rows"], report["command"] = earlier["rows"], f"{earlier['command']}` and `{report['command']}"
+        if earlier["commit"] == report["commit"]:
+            report["rows"], report["command"] = earlier["rows"], f"{earlier['command']}` and `{report['command']}"
     setups = LARGE if args.large else [TABLE[0], TABLE[2], FIGURE[0], FIGURE[2]] if args.quick else [*TABLE, *FIGURE]
     measured = {(setup.part, setup.spheres) for setup in setups}
     report["rows"] = [row for row in report["rows"] if (row["part"], row["spheres"]) not in measured]
     figure = None if args.no_figure else stem.with_suffix(".png")
     for setup in setups:
-        report["rows"].append(in_own_process(setup, args.device, args.threads, times))
+        report["rows"].append(in_own_process(setup, args.device, args.threads, times) | {"times": times})
         print(json.dumps(report["rows"][-1]), flush=True)
         stem.with_suffix(".json").write_text(json.dumps(report, indent=1) + "\n")         # after each, should the next not end
         stem.with_suffix(".md").write_text(markdown(report, figure and figure.name))

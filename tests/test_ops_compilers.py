@@ -73,6 +73,23 @@ def test_the_default_compiler(backend: Backend) -> None:
     assert_close(gradients(got, args), gradients(want, args), 1e-14)
 
 
+@pytest.mark.parametrize("dynamic", [False, True])
+@pytest.mark.usefixtures("fresh_dynamo")
+def test_density_control_gets_its_gradients_from_compiled_code(backend: Backend, dynamic: bool) -> None:
+    """The screen-space gradient, and that of AbsGS."""
+    def shot(offset: Tensor, absgrad: Tensor) -> Tensor:
+        image: Tensor = tsplat.rasterize(*s, cam, screen_offset=offset, absgrad=absgrad).image.square().mean()
+        return image
+
+    s, cam = backend.put(scenes.splats(9)), backend.put(scenes.camera(2, WIDTH, HEIGHT))
+    probes = [torch.zeros(2, 9, 2, dtype=backend.dtype, device=backend.device, requires_grad=True) for _ in range(2)]
+    want = torch.autograd.grad(shot(*probes), probes)
+    got = torch.autograd.grad(torch.compile(shot, fullgraph=True, backend="aot_eager", dynamic=dynamic)(*probes), probes)
+    assert_close(got, want, 1e-14)
+    assert bool((want[1] >= want[0].abs() * (1 - 1e-12)).all())
+    assert bool((want[0] != 0).any())
+
+
 @pytest.mark.usefixtures("fresh_dynamo")
 def test_a_camera_object_passes_into_compiled_code(backend: Backend) -> None:
     s, cam = scenes.splats(6), scenes.camera(None, WIDTH, HEIGHT, model="fisheye")

@@ -292,6 +292,8 @@ WRONG: list[tuple[type[Exception], str, dict[str, Any]]] = [
     (TypeError, "tile: expected an int of at least 1; got 8.0", {"tile": 8.0}),
     # wrong types of numbers, too, name the argument
     (TypeError, "eps2d: expected", {"eps2d": "0.3"}),
+    (TypeError, "antialiased: expected True or False; got 'yes'", {"antialiased": "yes"}),
+    (TypeError, "drop_last: expected True or False; got 1", {"drop_last": 1}),
     (TypeError, "alpha_max: expected", {"alpha_max": None}),
     (TypeError, "sh_degree: expected", {"sh_degree": 1.0, "colors": scenes.sh_coefficients(5, 1)}),
 ]

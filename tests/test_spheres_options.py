@@ -179,6 +179,7 @@ BAD: list[tuple[dict[str, Any], type[Exception], str]] = [
     ({"distance": "arc"}, ValueError, "distance: expected one of 'orthogonal', 'chord'; got 'arc'"),
     ({"depth": "metric"}, ValueError, "depth: expected one of"),
     ({"n_track": -1}, ValueError, "n_track: expected at least 1; got -1"),
+    ({"tracked_only": "no"}, TypeError, "tracked_only: expected True or False; got 'no'"),
     ({"tracked_only": True}, ValueError, "tracked_only: expected n_track of at least 1"),
     ({"percent_allowed_difference": 1.0}, ValueError, r"percent_allowed_difference: expected a number in \[0, 1\)"),
     ({"fade_below": -1}, ValueError, "fade_below: expected a radius in pixels of at least 0; got -1"),

@@ -58,6 +58,12 @@ def check_size(name: str, value: object) -> None:
         raise ValueError(f"{name}: expected at least 1; got {value}")
 
 
+def check_flag(name: str, value: object) -> None:
+    """Check that `value` is True or False."""
+    if not isinstance(value, bool):
+        raise TypeError(f"{name}: expected True or False; got {value!r}")
+
+
 def check_choice(name: str, value: object, choices: Sequence[object]) -> None:
     """Check that `value` is one of `choices`."""
     if value not in choices:

@@ -11,7 +11,7 @@ from tsplat_reference.constants import ALPHA_MAX, EPS2D
 
 from tsplat import ops
 from tsplat.camera import MODELS, Camera
-from tsplat.checks import check_choice, check_number, check_size, check_tensor
+from tsplat.checks import check_choice, check_flag, check_number, check_size, check_tensor
 from tsplat.drawn import Drawn, is_finite, shade
 
 if TYPE_CHECKING:
@@ -149,8 +149,8 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
         from tsplat import distributed  # only where it is used: some builds of torch have no torch.distributed
         ranks = distributed.check_group(group)
         group = group if ranks > 1 else None            # one has nothing to exchange
-    _check(means, quats, scales, opacities, colors, camera, sh_degree, covars, background, depth, eps2d, alpha_max, screen_offset, absgrad,
-           tile, capacity, ranks)
+    _check(means, quats, scales, opacities, colors, camera, sh_degree, covars, background, depth, antialiased, eps2d, alpha_max, drop_last,
+           screen_offset, absgrad, tile, capacity, ranks)
     C, width, height = len(camera), camera.width, camera.height
     viewmats, Ks = (camera.viewmats, camera.Ks) if camera.batched else (camera.viewmats[None], camera.Ks[None])
     if group is not None:
@@ -200,8 +200,9 @@ def rasterize(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacit
 
 
 def _check(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities: Tensor, colors: Tensor, camera: Camera,
-           sh_degree: int | None, covars: Tensor | None, background: Tensor | None, depth: str | None, eps2d: float, alpha_max: float,
-           screen_offset: Tensor | None, absgrad: Tensor | None, tile: int, capacity: int | None, ranks: int) -> None:
+           sh_degree: int | None, covars: Tensor | None, background: Tensor | None, depth: str | None, antialiased: bool, eps2d: float,
+           alpha_max: float, drop_last: bool, screen_offset: Tensor | None, absgrad: Tensor | None, tile: int, capacity: int | None,
+           ranks: int) -> None:
     """Errors that name the argument, what came and what is expected."""
     check_tensor("means", means, ("N", 3))
     if means.dtype not in (torch.float32, torch.float64):
@@ -237,6 +238,8 @@ def _check(means: Tensor, quats: Tensor | None, scales: Tensor | None, opacities
         check_tensor("background", background, (D,) if getattr(background, "ndim", 1) < 2 else (C, D), like=means)
     if depth is not None:
         check_choice("depth", depth, ("accumulated", "expected"))
+    check_flag("antialiased", antialiased)
+    check_flag("drop_last", drop_last)
     check_number("eps2d", eps2d, "a number of at least 0, in pixels squared")
     check_number("alpha_max", alpha_max, "a number in (0, 1)")
     if not 0 <= eps2d < float("inf"):

@@ -11,7 +11,7 @@ from tsplat_reference import hit_weights
 
 from tsplat import ops
 from tsplat.camera import Camera
-from tsplat.checks import NUMBERS, check_choice, check_number, check_size, check_tensor
+from tsplat.checks import NUMBERS, check_choice, check_flag, check_number, check_size, check_tensor
 from tsplat.rasterize import TILE, DepthMode
 
 Distance = Literal["orthogonal", "chord"]
@@ -201,6 +201,7 @@ def _check(positions: Tensor, features: Tensor, radii: Tensor, camera: Camera, o
         check_choice("depth", depth, ("accumulated", "expected"))
     if n_track:
         check_size("n_track", n_track)
+    check_flag("tracked_only", tracked_only)
     if tracked_only and not n_track:
         raise ValueError("tracked_only: expected n_track of at least 1 with it; got n_track = 0")
     check_number("percent_allowed_difference", tolerance, "a number in [0, 1)")

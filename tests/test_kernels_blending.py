@@ -176,7 +176,7 @@ def test_tiles_beyond_32_bits() -> None:
     wanted = torch.tensor([0, side * side - 1, side * side + side - 1, 2 * side * side - side // 2])
     radii, conics = torch.ones(2, 2, 2, dtype=torch.int32), torch.tensor([2.0, 0.0, 2.0], dtype=torch.float64).expand(2, 2, 3)
     put = [guarded(x, DEVICE) for x in (radii, means2d, conics, torch.full((2, 2), 0.9, dtype=torch.float64), torch.arange(4, dtype=torch.int32),
-                                        torch.ones(4, dtype=torch.int32), torch.arange(1, 5))]
+                                        torch.arange(1, 5))]
     keys, ids = torch.zeros(4, dtype=torch.int64, device=DEVICE), torch.zeros(4, dtype=torch.int32, device=DEVICE)
     binning.emit_kernel[(1,)](*put, keys, ids, 4, 2, size, size, side, side, 4, EPS=2.2e-16, TILE=TILE, SIDE=8, BLOCK=32)
     assert torch.equal(keys.cpu() >> 32, wanted)

@@ -14,8 +14,8 @@ import triton.language as tl
 from torch import Tensor
 from tsplat_reference.constants import ALPHA_MIN, BIN_ROUNDING, BIN_SLACK, BIN_SLACK_RELATIVE, FLATTEST
 
-from tsplat.kernels.footprint import TILE
 from tsplat.kernels.launch import Launcher, ceil_div, launch
+from tsplat.kernels.tiles import TILE
 
 SIDE = tl.constexpr(8)
 """Tiles along the side of a bin: a row of them is a byte."""

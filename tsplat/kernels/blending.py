@@ -14,9 +14,10 @@ from torch import Tensor
 
 from tsplat.kernels import footprint
 from tsplat.kernels.feature_blending import feature_bwd_kernel, feature_colors_bwd_kernel, feature_fwd_kernel
-from tsplat.kernels.footprint import LOG2_MIN, SUMS, T_MIN, TILE
+from tsplat.kernels.footprint import LOG2_MIN, SUMS, T_MIN
 from tsplat.kernels.launch import Launcher, ceil_div, current_target, launch
 from tsplat.kernels.tiles import (
+    TILE,
     add_tile_sums,
     block_pixels,
     blocks,
@@ -29,7 +30,6 @@ from tsplat.kernels.tiles import (
     of_batch,
     prefetch_records,
     row_dot,
-    row_moments,
     store_half,
     tile_list,
 )
@@ -225,8 +225,7 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
                 reciprocal = 1.0 / T
             v = w * (g - rest * reciprocal)
             v = tl.where(alpha < tl.full((), ALPHA_MAX, x.dtype), v, 0.0)
-            row_s0, row_x, row_xx = row_moments(v)
-            s0, sx, sy, sxx, sxy, syy = lane_moments(row_s0, row_x, row_xx, mx, my, y)
+            s0, sx, sy, sxx, sxy, syy = lane_moments(v, mx, my, l00, l10, l11, x, y)
             w0 = row_dot(w, v0)
             w1 = row_dot(w, v1) if D > 1 else none
             w2 = row_dot(w, v2) if D > 2 else none

@@ -9,8 +9,9 @@ from __future__ import annotations
 import triton
 import triton.language as tl
 
-from tsplat.kernels.footprint import LOG2_MIN, SUMS, T_MIN, TILE
+from tsplat.kernels.footprint import LOG2_MIN, SUMS, T_MIN
 from tsplat.kernels.launch import Launcher
+from tsplat.kernels.tiles import TILE
 
 
 @triton.jit
@@ -163,7 +164,7 @@ def feature_bwd_kernel(records, colors, ids, offsets, rest_image, v_weights, v_i
         v = wg - alpha / (1.0 - alpha) * (rest[:, None] - tl.cumsum(wg, 1))
         v = tl.where(alpha < tl.full((), ALPHA_MAX, dt), v, 0.0)
         rest -= tl.sum(wg, 1)
-        s0, sx, sy, sxx, sxy, syy = block_moments(v, mx, my, x, y)
+        s0, sx, sy, sxx, sxy, syy = block_moments(v, mx, my, l00, l10, l11, x, y)
         add_moments(sums, splat, s0, sx, sy, sxx, sxy, syy, real)
         if ABSGRAD:
             q = (sums + splat * SUMS)[None, :]

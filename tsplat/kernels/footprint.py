@@ -1,8 +1,11 @@
 """The Gaussian footprint as device functions: what blending knows of the shape of a splat.
 
 A kernel gets `log2_alpha` and the sums of its derivative as constexprs and has no formula of its own, so that another footprint is another
-set of these functions. A record is 12 numbers, three 16-byte loads: mean x, mean y, l00, l10 | l11, log2 opacity, colour 0, 1 | colour 2,
-3, two that pad (colours only up to 4 channels), with
+set of these functions, as in tests/test_kernels_footprint.py. It may be any function of the record with the opacity as a factor, whose
+derivatives by mean and conic are the Gaussian's times a number for each pixel: that is what `unpack_kernel` makes of the six sums.
+
+A record is 12 numbers, three 16-byte loads: mean x, mean y, l00, l10 | l11, log2 opacity, colour 0, 1 | colour 2, 3, two that pad (colours only
+up to 4 channels), with
 
     log2 alpha = log2 o - (l00 dx + l10 dy)^2 - (l11 dy)^2,
 
@@ -17,11 +20,10 @@ import triton.language as tl
 from tsplat_reference.constants import ALPHA_MIN, TRANSMITTANCE_MIN
 
 from tsplat.kernels.launch import Launcher
+from tsplat.kernels.tiles import row_moments
 
 LOG2_MIN = tl.constexpr(math.log2(ALPHA_MIN))
 T_MIN = tl.constexpr(TRANSMITTANCE_MIN)
-TILE = tl.constexpr(8)
-"""Side of a tile: a lane takes a row."""
 RECORD = 12
 """Numbers in a record."""
 SUMS = tl.constexpr(12)
@@ -46,8 +48,9 @@ def mean_slopes(mx, my, l00, l10, l11, x, y):
 
 
 @triton.jit
-def lane_moments(s0, local_x, local_xx, mx, my, y):
-    """Per lane: the six sums over the pixels of a row at y, of which those of 1, x and x^2 about the tile's centre are given."""
+def lane_moments(v, mx, my, l00, l10, l11, x, y):
+    """Per lane: the six sums over the pixels of its row, at y, of v: dL/dlog alpha, times 1, dx, dy, dx^2, dx dy and dy^2."""
+    s0, local_x, local_xx = row_moments(v)
     sx = local_x - mx * s0                              # shifted to the mean once per row, not per pixel
     sxx = local_xx - mx * (local_x + sx)
     dy = y - my
@@ -56,8 +59,8 @@ def lane_moments(s0, local_x, local_xx, mx, my, y):
 
 
 @triton.jit
-def block_moments(v, mx, my, x, y):
-    """The six sums `[1, K]` over the pixels (rows) of v `[P, K]`."""
+def block_moments(v, mx, my, l00, l10, l11, x, y):
+    """As `lane_moments`: the six sums `[1, K]` over the pixels (rows) of v `[P, K]`."""
     dx = x - mx
     dy = y - my
     vx = v * dx

@@ -17,9 +17,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from tsplat.kernels.footprint import SUMS, TILE, store4
+from tsplat.kernels.footprint import SUMS, store4
 from tsplat.kernels.launch import Launcher, ceil_div, launch
-from tsplat.kernels.tiles import load4, row_dot
+from tsplat.kernels.tiles import TILE, load4, row_dot
 
 CHANNELS = 4
 """Up to here a sphere's features are in its record and a pixel's in registers."""

@@ -7,10 +7,9 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from tsplat.kernels.footprint import TILE
 from tsplat.kernels.launch import Launcher, current_target, launch
 from tsplat.kernels.sphere_geometry import Spheres, enter, far_off, load_sphere, rays, reciprocal
-from tsplat.kernels.tiles import block_pixels, blocks, glue, lane_x, load_batch, of_batch, prefetch_records, tile_list, tile_min
+from tsplat.kernels.tiles import TILE, block_pixels, blocks, glue, lane_x, load_batch, of_batch, prefetch_records, tile_list, tile_min
 
 SLOTS = 5
 """Hits that a pass over the spheres finds: as many as all targets have registers for."""

@@ -11,7 +11,7 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from tsplat.kernels.footprint import SUMS, TILE
+from tsplat.kernels.footprint import SUMS
 from tsplat.kernels.launch import Launcher, ceil_div, current_target, launch
 from tsplat.kernels.sphere_features import sphere_feature_bwd_kernel, sphere_feature_fwd_kernel, sphere_features_bwd_kernel
 from tsplat.kernels.sphere_geometry import (
@@ -33,6 +33,7 @@ from tsplat.kernels.sphere_geometry import (
 from tsplat.kernels.sphere_outlines import outlines as outlines
 from tsplat.kernels.sphere_tracking import nearest_hits as nearest_hits
 from tsplat.kernels.tiles import (
+    TILE,
     add_tile_sums,
     block_pixels,
     blocks,

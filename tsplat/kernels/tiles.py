@@ -9,8 +9,10 @@ import triton
 import triton.language as tl
 from torch import Tensor
 
-from tsplat.kernels.footprint import TILE
 from tsplat.kernels.launch import ceil_div
+
+TILE = tl.constexpr(8)
+"""Side of a tile: a lane takes a row."""
 
 
 @triton.jit

@@ -234,6 +234,12 @@ def test_look_at_takes_up_at_a_small_angle_to_the_view() -> None:
     assert_close(R, torch.eye(3, dtype=torch.float64), 1e-15)
 
 
+def test_vmap_over_cameras_is_told_of_batches() -> None:
+    cam = camera(3)
+    with pytest.raises(NotImplementedError, match=re.escape("give the viewmats [C, 4, 4] and Ks [C, 3, 3] of all cameras in one call")):
+        torch.func.vmap(lambda v, K: Camera(v, K, WIDTH, HEIGHT).Ks)(cam.viewmats, cam.Ks)
+
+
 def test_look_at_refuses_to_look_at_itself() -> None:
     with pytest.raises(ValueError, match=r"^eye, target: expected two points; got \[1\.0, 2\.0, 3\.0\] and"):
         Camera.look_at((1.0, 2.0, 3.0), (1.0, 2.0, 3.0), width=8, height=8)

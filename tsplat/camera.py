@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -19,6 +19,9 @@ NO_SKEW = 1e-5
 """What may be off in the entries of Ks that are not used, as if by rounding: a part of fx or fy, 0.01 pixel at 1000 from the centre."""
 PARALLEL = 1e-6
 """Least angle in radians between the view and `up`."""
+
+# private; should a release of torch be without it, vmap has an error of its own
+_is_mapped: Callable[[Tensor], bool] = getattr(torch._C._functorch, "is_batchedtensor", lambda _: False)
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,9 @@ class Camera:
         if self.viewmats.ndim not in (2, 3) or self.viewmats.shape[:-2] != self.Ks.shape[:-2]:
             raise ValueError("camera.viewmats, camera.Ks: expected [C, 4, 4] and [C, 3, 3], or [4, 4] and [3, 3]; "
                              f"got {list(self.viewmats.shape)} and {list(self.Ks.shape)}")
+        if not torch.compiler.is_compiling() and (_is_mapped(self.viewmats) or _is_mapped(self.Ks)):
+            raise NotImplementedError("camera: a Camera cannot be made under torch.func.vmap; give the viewmats [C, 4, 4] and Ks [C, 3, 3] of all "
+                                      "cameras in one call, which is faster, too")
         if self.viewmats.device.type == "cpu" and not torch.compiler.is_compiling():
             for name, matrices in (("camera.viewmats", self.viewmats), ("camera.Ks", self.Ks)):
                 if not bool(matrices.isfinite().all()):

@@ -308,7 +308,7 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
     v_alphas = None if v_alphas is None else v_alphas.contiguous()
     sums = means2d.new_zeros(len(ids) if deterministic else s.R + 1, SUMS.value)
     few = s.D <= CHANNELS
-    v_colors = colors.new_empty(s.C, s.N, s.D) if few else torch.zeros_like(s.colors)
+    v_colors = None if few else torch.zeros_like(s.colors)
     if few:
         blend_bwd_kernel[(s.blocks,)](s.records, s.ids, s.offsets, s.backgrounds, image, alphas, v_image, v_alphas, sums, s.lane_x, width,
                                       height, *s.grid, s.R, BACKGROUND=backgrounds is not None, ABSGRAD=absgrad, PER_HIT=deterministic,
@@ -332,6 +332,7 @@ def blend_backward(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: T
             ABSGRAD=absgrad, block_moments=footprint.block_moments, mean_slopes=footprint.mean_slopes, **launch("features_backward"),
             **s.block)
     del s.records                                       # its memory is enough for what comes now
+    v_colors = colors.new_empty(s.C, s.N, s.D) if v_colors is None else v_colors
     v_means2d, v_conics, v_opacities = means2d.new_empty(means2d.shape), torch.empty_like(s.conics), torch.empty_like(s.opacities)
     v_abs = means2d.new_empty(s.C, s.N if absgrad else 0, 2)
     if s.R:

@@ -1,4 +1,5 @@
-"""The benchmark page: one table for each JSON document in `bench/results`, newest first, with device, versions, commit, date and command.
+"""The benchmark page: one table for each JSON document in `bench/results`, newest first, with device, versions, commit, date and command; one for
+all of Pulsar's applications.
 
 python bench/page.py              # writes bench/results/README.md
 python bench/page.py --check      # only says whether it is as this would write it
@@ -107,6 +108,21 @@ OFFLOAD: Columns = {
     "MiB up": lambda r: f"{r['with']['up_MiB']:.2f}",
 }
 
+APPLICATIONS: Columns = {
+    "application": lambda r: f"[{r['application']}]({r['file']})",
+    "figure": lambda r: r["measure"],
+    "by stage (spheres)": lambda r: "; ".join(
+        f"{name} {figure:.4g}" + (f" ({r['counts'][name]:,})" if name in r.get("counts", {}) else "") for name, figure in r["figures"].items()),
+    "goal": lambda r: f"{r['goal']:g}: {'met' if r['met'] else 'missed'}" if "goal" in r else "",
+    "spheres": lambda r: f"{r['spheres']:,}",
+    "steps": lambda r: f"{r['steps']:,}",
+    "relocated": lambda r: f"{r['relocated']:,}" if "relocated" in r else "",
+    "wall s": lambda r: f"{r['wall_s']:.0f}",
+    "CPU s": lambda r: f"{r['cpu_s']:.0f}",
+    "to know": lambda r: r.get("note", ""),
+    "how": lambda r: f"`{r['command']}`, {r['machine']}, {r['threads']} threads, torch {r['torch']}, commit {r['commit']}, {r['date']}",
+}
+
 
 def sections(report: Row) -> list[tuple[str, Columns, list[Row]]]:
     """Title, columns and rows of what a document has."""
@@ -132,13 +148,19 @@ def table(columns: Columns, rows: list[Row]) -> list[str]:
 
 def page(folder: Path) -> str:
     """The text, of all documents in the folder."""
-    lines = [HEAD]
+    lines, applications = [HEAD], []
     for path in sorted(folder.glob("*.json"), reverse=True):
         report = json.loads(path.read_text(encoding="utf-8"))
+        if "application" in report:
+            applications.append(report | {"file": path.name})
+            continue
         for title, columns, rows in sections(report):
             versions = [f"{key} {report[key]}" for key in ("torch", "triton", "gsplat", "threads") if report.get(key)]
             lines += [f"## {title}", "", f"{report.get('machine') or report['device']}, {report['date']}, {', '.join(versions)}"
                       + (f": `{report['command']}`" if "command" in report else "") + f" ([{path.name}]({path.name}))", "", *table(columns, rows), ""]
+    if applications:
+        lines += ["## Pulsar's applications", "", "Their pictures lie in `bench/pictures`. Steps: of Adam, in all. Relocated: spheres put elsewhere "
+                  "between rounds of steps. CPU s: of all threads.", "", *table(APPLICATIONS, applications), ""]
     lines += ["## In words", "", "What else was measured, and what was tried: " + ", ".join(
         f"[{path.stem}]({path.name})" for path in sorted(folder.glob("2*.md"), reverse=True)) + ".", ""]
     return "\n".join(lines)

@@ -77,6 +77,11 @@ def least_distance(s: scenes.Splats2D, c: int, width: int, height: int, tile: in
     return torch.where(inside, 0.0, torch.stack(torch.broadcast_tensors(*sides)).amin(0))
 
 
+def put(s: scenes.Splats2D, backend: Backend) -> scenes.Splats2D:
+    """On the device of a backend, in their own precision."""
+    return scenes.Splats2D(*[None if x is None else x.to(backend.device) for x in s])
+
+
 def splats(size: str, seed: int, width: int, height: int, dtype: torch.dtype) -> scenes.Splats2D:
     s = scenes.splats2d(2, 60, width, height, seed=seed, size=SIZES[size], opacity=(1 / 255, 1.0))
     s = needle_ends(s, seed) if size == "ends" else s
@@ -97,10 +102,10 @@ def needle_ends(s: scenes.Splats2D, seed: int) -> scenes.Splats2D:
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("tile", [4, 5, 8, 16])
-def test_no_pixel_is_lost(size: str, tile: int, dtype: torch.dtype) -> None:
+def test_no_pixel_is_lost(backend: Backend, size: str, tile: int, dtype: torch.dtype) -> None:
     for seed in range(3):
         s = splats(size, seed, 61, 47, dtype)
-        ours = hit_table(s, 61, 47, tile)
+        ours = hit_table(put(s, backend), 61, 47, tile)
         for c in range(2):
             exact = touched(s, c, 61, 47, tile)
             assert exact.any()
@@ -114,7 +119,7 @@ def test_a_tile_is_hit_only_if_the_ellipse_touches_its_pixel_centres_rectangle(b
                                                                                dtype: torch.dtype) -> None:
     """But for the slack that `bin_splats` states: of the level; of c, rounded in w once more; and of positions, rounded once more."""
     s = splats(size, 0, 61, 47, dtype)
-    ours = hit_table(scenes.Splats2D(*[x.to(backend.device) for x in s]), 61, 47, tile)
+    ours = hit_table(put(s, backend), 61, 47, tile)
     slack = constants.BIN_ROUNDING * torch.finfo(dtype).eps
     s = scenes.Splats2D(*[x.double() if x.is_floating_point() else x for x in s])
     a, b, c = s.conics.unbind(-1)
@@ -132,14 +137,14 @@ def test_a_tile_is_hit_only_if_the_ellipse_touches_its_pixel_centres_rectangle(b
             assert ours[i].sum() <= 1.02 * exact.sum() + 1
 
 
-def test_a_splat_hits_no_tile_outside_its_box() -> None:
+def test_a_splat_hits_no_tile_outside_its_box(backend: Backend) -> None:
     cam = scenes.camera(2, 61, 47)
     p = scenes.splats(100)
     projected = reference.project(p.means, p.quats, p.scales, None, p.opacities, cam.viewmats, cam.Ks, 61, 47, "pinhole", 0.01,
                                   1e10, 0.3, False)
     s = scenes.Splats2D(projected.means2d, projected.conics, p.opacities.expand(2, -1), p.colors, None, projected.depths,
                         projected.radii)
-    ours = hit_table(s, 61, 47, 8)
+    ours = hit_table(put(s, backend), 61, 47, 8)
     low, high = s.means2d - s.radii, s.means2d + s.radii
     x, y = torch.arange(8)[None, None, :, None] * 8, torch.arange(6)[None, :, None, None] * 8
     box = ((low[:, None, None, :, 0] < x + 8) & (high[:, None, None, :, 0] > x) & (low[:, None, None, :, 1] < y + 8)
@@ -149,12 +154,12 @@ def test_a_splat_hits_no_tile_outside_its_box() -> None:
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64, torch.bfloat16])
-def test_each_list_goes_front_to_back_and_equals_by_index(dtype: torch.dtype) -> None:
+def test_each_list_goes_front_to_back_and_equals_by_index(backend: Backend, dtype: torch.dtype) -> None:
     s = scenes.splats2d(3, 50, 32, 24, size=(2.0, 9.0))
     g = scenes.generator(5)
     depths = torch.randint(-3, 4, (3, 50), generator=g).to(dtype) * 1.5e3        # many equal ones, many negative
     depths[:, ::7] *= 0.0                                                        # of either sign
-    result = bins(s._replace(depths=depths), 32, 24, 8)
+    result = bins(put(s._replace(depths=depths), backend), 32, 24, 8)
     flat = depths.flatten().double().tolist()
     assert max(map(len, lists(result))) > 20
     assert {math.copysign(1.0, d) for d in flat if d == 0} == {1.0, -1.0}
@@ -162,9 +167,8 @@ def test_each_list_goes_front_to_back_and_equals_by_index(dtype: torch.dtype) ->
         assert ids == sorted(ids, key=lambda i: (flat[i], i))
 
 
-def test_offsets_frame_the_lists() -> None:
-    s = scenes.splats2d(3, 20, 30, 20)
-    ids, offsets = bins(s, 30, 20, 8)
+def test_offsets_frame_the_lists(backend: Backend) -> None:
+    ids, offsets = bins(put(scenes.splats2d(3, 20, 30, 20), backend), 30, 20, 8)
     assert ids.dtype == torch.int32
     assert offsets.dtype == torch.int64
     assert offsets.shape == (3 * 4 * 3 + 1,)
@@ -173,59 +177,62 @@ def test_offsets_frame_the_lists() -> None:
     assert (offsets.diff() >= 0).all()
 
 
+@pytest.mark.parametrize("tile", [1, 8])
 @pytest.mark.parametrize(("width", "height"), [(180, 182), (181, 182), (255, 257), (256, 257), (300, 300)])
-def test_any_number_of_tiles(width: int, height: int) -> None:
-    """Around 2^15 and 2^16, where narrower keys would overflow."""
+def test_any_number_of_tiles(backend: Backend, width: int, height: int, tile: int) -> None:
+    """Of one pixel, around 2^15 and 2^16, where narrower keys would overflow; of 8, for the kernels, which take 8 x 8 of them together, in whole and
+    in broken groups. (As many of these as of pixels: in `test_kernels_blending.py`.)"""
     s = scenes.splats2d(1, 12, width, height, size=(0.5, 3.0))
     last = s.means2d.clone()
     last[0, -1] = torch.tensor([width - 0.5, height - 0.5])                      # into the last tile
     s = s._replace(means2d=last)
-    ours = hit_table(s, width, height, 1)
-    assert ours.shape == (1, height, width, 12)
+    ours = hit_table(put(s, backend), width, height, tile)
+    assert ours.shape == (1, math.ceil(height / tile), math.ceil(width / tile), 12)
     assert ours[0, -1, -1, -1]
-    assert torch.equal(ours[0].sum(-1).bool(), ours[0].any(-1))
-    exact = touched(s, 0, width, height, 1)
+    exact = touched(s, 0, width, height, tile)
     assert not (exact & ~ours[0]).any()
-    assert ours[0].sum() <= exact.sum() * 1.01 + 2                               # one pixel is the whole rectangle
+    if tile == 1:
+        assert ours[0].sum() <= exact.sum() * 1.01 + 2                           # one pixel is the whole rectangle
 
 
-def test_tiles_with_one_splat_and_with_none() -> None:
+def test_tiles_with_one_splat_and_with_none(backend: Backend) -> None:
     s = scenes.splats2d(1, 1, 64, 8, size=(0.5, 0.6), opacity=(0.5, 0.5))
     s = s._replace(means2d=torch.tensor([[[28.0, 4.0]]]).double())
-    assert lists(bins(s, 64, 8, 8)) == [[], [], [], [0], [], [], [], []]
+    assert lists(bins(put(s, backend), 64, 8, 8)) == [[], [], [], [0], [], [], [], []]
 
 
-def test_a_splat_between_pixel_centres_may_hit_nothing() -> None:
+def test_a_splat_between_pixel_centres_may_hit_nothing(backend: Backend) -> None:
     """A point at the corner of four pixels is below 1/255 at all of their centres, and no tile need be paid for."""
     s = scenes.splats2d(1, 1, 16, 16, size=(0.1, 0.1), opacity=(0.5, 0.5))
     s = s._replace(means2d=torch.tensor([[[8.0, 8.0]]]).double())
-    assert bins(s, 16, 16, 8).ids.numel() == 0
+    assert bins(put(s, backend), 16, 16, 8).ids.numel() == 0
 
 
 @pytest.mark.parametrize("count", [0, 5])
-def test_nothing_visible_gives_empty_lists(count: int) -> None:
+def test_nothing_visible_gives_empty_lists(backend: Backend, count: int) -> None:
     s = scenes.splats2d(2, count, 30, 20)
-    ids, offsets = bins(s._replace(radii=torch.zeros_like(s.radii)), 30, 20, 8)
+    ids, offsets = bins(put(s._replace(radii=torch.zeros_like(s.radii)), backend), 30, 20, 8)
     assert ids.shape == (0,)
-    assert torch.equal(offsets, torch.zeros(2 * 12 + 1, dtype=torch.int64))
+    assert torch.equal(offsets.cpu(), torch.zeros(2 * 12 + 1, dtype=torch.int64))
 
 
-def test_culled_splats_do_not_appear_whatever_their_numbers() -> None:
+def test_culled_splats_do_not_appear_whatever_their_numbers(backend: Backend) -> None:
     s = scenes.splats2d(2, 30, 30, 20)
-    want = lists(bins(s, 30, 20, 8))
+    want = lists(bins(put(s, backend), 30, 20, 8))
     radii, broken = s.radii.clone(), [x.clone() for x in (s.means2d, s.conics, s.opacities, s.depths)]
     radii[:, ::3] = 0
     for x in broken:
         x[:, ::3] = math.nan
-    got = lists(bins(scenes.Splats2D(broken[0], broken[1], broken[2], s.colors, None, broken[3], radii), 30, 20, 8))
+    culled = scenes.Splats2D(broken[0], broken[1], broken[2], s.colors, None, broken[3], radii)
+    got = lists(bins(put(culled, backend), 30, 20, 8))
     assert got == [[i for i in ids if i % 30 % 3] for ids in want]
 
 
-def test_a_splat_visible_along_one_axis_only_is_culled() -> None:
+def test_a_splat_visible_along_one_axis_only_is_culled(backend: Backend) -> None:
     s = scenes.splats2d(1, 2, 30, 20, size=(3.0, 4.0))
     radii = s.radii.clone()
     radii[0, 0, 1] = 0
-    assert set(bins(s._replace(radii=radii), 30, 20, 8).ids.tolist()) <= {1}
+    assert set(bins(put(s._replace(radii=radii), backend), 30, 20, 8).ids.tolist()) == {1}
 
 
 @pytest.mark.parametrize("dtype", [torch.int16, torch.int32, torch.int64])

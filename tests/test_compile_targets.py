@@ -34,6 +34,11 @@ def test_no_kernel_spills(target: str, tmp_path: Path) -> None:
     assert "may_see_kernel" in names
     assert any("harmonics" in n for n in names)
     assert {(k["kernel"], k["label"]): k["spills"] for k in kernels if k["spills"] != 0} == {}
+    if target == "sm_90":                               # instructions per pair of pixel and splat, of RGB in float32
+        goals = {"blend_fwd_kernel": 13.5, "blend_bwd_kernel": 35}
+        counts = {k["kernel"]: k["per_pair"] for k in kernels if k["kernel"] in goals and k["label"] == "3 channels"}
+        assert counts.keys() == goals.keys()
+        assert {name: count for name, count in counts.items() if count > goals[name]} == {}
     for name in ("blend_bwd_kernel", "sphere_bwd_kernel") if target == "sm_90" else ():
         atomics = {k["label"]: sum(loop.get("atomic", 0) for loop in k["loops"]) for k in kernels if k["kernel"] == name}
         assert atomics["3 channels"] > 0

@@ -1,15 +1,18 @@
-"""What Pulsar's applications share: spheres to optimise, views to compare with, the loop, and pictures."""
+"""What Pulsar's applications share: spheres to optimise, views to compare with, the loop, pictures, and the report."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import math
 import os
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -19,20 +22,27 @@ from tsplat.fit.spheres import gamma_at, refine
 from tsplat.scene import load_capture, write_image
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.append(str(ROOT / "bench"))
+
+from output import add_json, environment, print_json, printing  # noqa: E402
+
 PICTURES = ROOT / "bench" / "pictures"
 SLOWEST = 0.1
 """Part of the learning rates that the last step of a stage has."""
 LAST_ROUND = 0.1
+PSNR = "held-out PSNR, dB"
 
 
-def arguments(doc: str | None, picture: str, **options: float) -> argparse.ArgumentParser:
-    """The options of all applications, and those of one: numbers with defaults."""
+def arguments(doc: str | None, application: str, **options: float) -> argparse.ArgumentParser:
+    """The options of all applications, and those of one: numbers with defaults. The application's name is that of its script and its picture."""
     parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, default=Path(os.environ.get("TSPLAT_DATA", ROOT.parent / "shared")) / "data",
                         help="folder of the data sets (default: data in the folder TSPLAT_DATA)")
-    parser.add_argument("--picture", type=Path, default=PICTURES / picture, help="the picture to write")
+    parser.add_argument("--picture", type=Path, default=PICTURES / f"{application}.png", help="the picture to write")
     parser.add_argument("--targets", action="store_true", help="show the views, too: above, in the picture (for data that may be copied only)")
     parser.add_argument("--seed", type=int, default=0)
+    parser.set_defaults(application=application)
+    add_json(parser)
     for name, default in options.items():
         parser.add_argument("--" + name.replace("_", "-"), type=type(default), default=default, help=f"default {default}")
     return parser
@@ -166,18 +176,21 @@ def optimise(groups: list[dict[str, object]], views: Views, loss: Callable[[View
 
 def optimise_and_relocate(spheres: Spheres, views: Views, loss: Callable[[Spheres, Views, float], Tensor],
                           alive: Callable[[Spheres], Tensor], *, rounds: int, steps: int, size: float, speed: float, batch: int,
-                          gamma: tuple[float, float], generator: torch.Generator, name: str) -> Spheres:
+                          gamma: tuple[float, float], generator: torch.Generator, name: str) -> tuple[Spheres, int]:
     """`optimise` in rounds, of `steps` in all; between these, spheres that are not alive go where others are. From the first round to the last,
-    learning rates fall to `LAST_ROUND`: the shape comes first, its outline last."""
+    learning rates fall to `LAST_ROUND`: the shape comes first, its outline last. Returns the spheres, and how many went elsewhere, in all rounds."""
+    moved = 0
     fall = (gamma[1] / gamma[0]) ** (1 / rounds)
     for i in range(rounds):
         if i:
-            spheres = spheres.relocated(alive(spheres), generator)
+            live = alive(spheres)
+            moved += int((~live).sum())
+            spheres = spheres.relocated(live, generator)
         ends = gamma[0] * fall**i, gamma[0] * fall ** (i + 1)
         groups = spheres.groups(size, speed * LAST_ROUND ** (i / max(1, rounds - 1)))
         optimise(groups, views, partial(loss, spheres), steps=max(1, steps // rounds), batch=batch, gamma=ends, generator=generator,
                  name=f"{name} {i + 1}/{rounds}")
-    return spheres
+    return spheres, moved
 
 
 def psnr(image: Tensor, target: Tensor) -> float:
@@ -197,6 +210,29 @@ def write_rows(path: Path, rows: Iterable[Iterable[Tensor]], targets: Iterable[T
     write_image(path, torch.cat([torch.cat([image.expand(-1, -1, 3) for image in row], 1) for row in rows]).clamp(0, 1))
 
 
-def report(start: float, picture: Path) -> None:
-    """The CPU time since `start`, from `time.process_time`, and where the picture is."""
-    print(f"{time.process_time() - start:.0f} s of CPU time; {picture.name} written", flush=True)
+@contextlib.contextmanager
+def report(args: argparse.Namespace, measure: str, goal: float | None = None) -> Iterator[dict[str, Any]]:
+    """Around all that an application does: its time, and with `--json` its document, unless it fails.
+
+    Args:
+        args: its options.
+        measure: what its figures are.
+        goal: what the last of them is to reach.
+
+    Yields:
+        The document, into which the application puts `figures`, by stage; `spheres`, how many there are in the end; and `steps`, of Adam, in
+        all. Where they tell something: `counts`, of the spheres that each figure is of; `relocated`, how many were; `note`, what a reader of
+        the figures has to know.
+    """
+    wall, cpu = time.perf_counter(), time.process_time()
+    document: dict[str, Any] = {"application": args.application, "measure": measure}
+    with printing(args.json):
+        yield document
+        document |= {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
+        if goal is not None:
+            *_, last = document["figures"].values()
+            document |= {"goal": goal, "met": last >= goal}
+            print(f"{args.application}: goal {goal:g} {'met' if document['met'] else 'missed'}")
+        print(f"{document['cpu_s']:.0f} s of CPU time, {document['wall_s']:.0f} s in all; {args.picture.name} written", flush=True)
+    if args.json:
+        print_json(environment("cpu") | document)

@@ -2,17 +2,18 @@
 
     python bench/applications/illumination.py
 
-The spheres' features are normals, and a constant that tells the object from the background. Shading is a stage of its own, on the
-rendered normals: diffuse, by four parallel lights, in red, green, blue and white. 144 cameras at random azimuth and elevation. The targets are
-rendered from many points on the mesh, as small spheres with its normals. Prints the Chamfer distance to the mesh, in parts of its radius, before
-and after: mean distance of the spheres' visible sides to points on the mesh, and of these to them. The picture: targets, the start, the
-result, and its normals.
+The spheres' features are normals, and a constant that tells the object from the background. Shading is a stage of its own, on the rendered normals:
+diffuse, by four parallel lights, in red, green, blue and white. 144 cameras at random azimuth and elevation. The mesh itself is never drawn: the
+targets are tsplat's own, of 20,000 small spheres at points on it with its normals, in the same shading. So the figure tells that shape comes back
+from shading, not that the renderer or the shading agree with another's. Between rounds, spheres that no view sees, or that are nearly transparent,
+are put beside others. Prints the Chamfer distance to the mesh, in parts of its radius, before and after: mean distance of the spheres' visible
+sides to points on the mesh, and of these to them. Only spheres that the views see count there; how many these are, before and after, is printed
+too. The picture: targets, the start, the result, and its normals.
 """
 
 from __future__ import annotations
 
 import math
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -98,47 +99,51 @@ def with_alpha(normals: Tensor) -> Tensor:
 
 def main(argv: list[str] | None = None) -> tuple[float, float]:
     """Optimise, print and draw."""
-    parser = arguments(__doc__, "illumination.png", steps=200, rounds=4, batch=4, spheres=3000, samples=20_000, cameras=144, size=128)
+    parser = arguments(__doc__, "illumination", steps=200, rounds=4, batch=4, spheres=3000, samples=20_000, cameras=144, size=128)
     parser.add_argument("--mesh", default="cow.obj", help="a file of triangles in the data's folder `meshes`")
     args = parser.parse_args(argv)
-    start, generator = time.process_time(), torch.Generator().manual_seed(args.seed)
-    stage = Stage(torch.zeros(3), 1.15, DISTANCE, torch.zeros(4), fade_below=0.5)
-    surface = sample(*read_obj(args.data / "meshes" / args.mesh), args.samples, generator)
-    eyes = DISTANCE * normalize(torch.randn(args.cameras, 3, generator=generator), dim=1)
-    cameras = orbit(eyes, args.size, FOV)
-    radius = 4 / math.sqrt(args.samples)
-    dense = Spheres.of(surface.points - radius * surface.normals, torch.full((args.samples,), radius), with_alpha(surface.normals),
-                    torch.full((args.samples,), 0.9999))                                    # they touch the surface from within
-    with torch.no_grad():
-        views = Views(cameras, shade(torch.stack([stage.render(dense, cameras[i], SHARP) for i in range(args.cameras)])))
+    generator = torch.Generator().manual_seed(args.seed)
+    with report(args, "Chamfer distance to the mesh, radii of it") as document:
+        stage = Stage(torch.zeros(3), 1.15, DISTANCE, torch.zeros(4), fade_below=0.5)
+        surface = sample(*read_obj(args.data / "meshes" / args.mesh), args.samples, generator)
+        eyes = DISTANCE * normalize(torch.randn(args.cameras, 3, generator=generator), dim=1)
+        cameras = orbit(eyes, args.size, FOV)
+        radius = 4 / math.sqrt(args.samples)
+        dense = Spheres.of(surface.points - radius * surface.normals, torch.full((args.samples,), radius), with_alpha(surface.normals),
+                           torch.full((args.samples,), 0.9999))                                 # they touch the surface from within
+        with torch.no_grad():
+            views = Views(cameras, shade(torch.stack([stage.render(dense, cameras[i], SHARP) for i in range(args.cameras)])))
 
-    outwards = normalize(torch.randn(args.spheres, 3, generator=generator), dim=1)
-    spheres = Spheres.of(0.6 * outwards, torch.full((args.spheres,), 2.0 / math.sqrt(args.spheres)), with_alpha(outwards),
-                      torch.full((args.spheres,), 0.5))
+        outwards = normalize(torch.randn(args.spheres, 3, generator=generator), dim=1)
+        spheres = Spheres.of(0.6 * outwards, torch.full((args.spheres,), 2.0 / math.sqrt(args.spheres)), with_alpha(outwards),
+                             torch.full((args.spheres,), 0.5))
 
-    def render(spheres: Spheres, cameras: tsplat.Camera, gamma: float) -> Tensor:
-        return stage.render(spheres, cameras, gamma, with_alpha(spheres.features[:, :3]))      # the constant stays one
+        def render(spheres: Spheres, cameras: tsplat.Camera, gamma: float) -> Tensor:
+            return stage.render(spheres, cameras, gamma, with_alpha(spheres.features[:, :3]))      # the constant stays one
 
-    def loss(spheres: Spheres, some: Views, gamma: float) -> Tensor:
-        return (shade(render(spheres, some.cameras, gamma)) - some.images).abs().mean()
+        def loss(spheres: Spheres, some: Views, gamma: float) -> Tensor:
+            return (shade(render(spheres, some.cameras, gamma)) - some.images).abs().mean()
 
-    def alive(spheres: Spheres) -> Tensor:
-        return seen(spheres, stage, views, GAMMA[1]) & (spheres.opacities > 0.1)
+        def alive(spheres: Spheres) -> Tensor:
+            return seen(spheres, stage, views, GAMMA[1]) & (spheres.opacities > 0.1)
 
-    shown = views.cameras[:5]
-    with torch.no_grad():
-        first = render(spheres, shown, GAMMA[1])
-        before = chamfer(visible_sides(spheres, stage, views), surface.points)
-    spheres = optimise_and_relocate(spheres, views, loss, alive, rounds=args.rounds, steps=args.steps, size=1.0, speed=5.0, batch=args.batch,
-                                    gamma=GAMMA, generator=generator, name="illumination")
-    with torch.no_grad():
-        last, sides = render(spheres, shown, GAMMA[1]), visible_sides(spheres, stage, views)
-        after = chamfer(sides, surface.points)
-    print(f"illumination: {args.spheres} spheres, {len(sides)} of them seen in the end, {args.cameras} views of {args.size}x{args.size}, "
-          f"{args.steps} steps, Chamfer distance {before:.4f} before, {after:.4f} after")
-    normals = (normalize(last[..., :3], dim=-1) / 2 + 0.5) * (last[..., 3:] > 0.5)
-    write_rows(args.picture, [shade(first), shade(last), normals], views.images[:5])
-    report(start, args.picture)
+        shown = views.cameras[:5]
+        with torch.no_grad():
+            first = render(spheres, shown, GAMMA[1])
+            old_sides = visible_sides(spheres, stage, views)
+            before = chamfer(old_sides, surface.points)
+        spheres, moved = optimise_and_relocate(spheres, views, loss, alive, rounds=args.rounds, steps=args.steps, size=1.0, speed=5.0,
+                                               batch=args.batch, gamma=GAMMA, generator=generator, name="illumination")
+        with torch.no_grad():
+            last, sides = render(spheres, shown, GAMMA[1]), visible_sides(spheres, stage, views)
+            after = chamfer(sides, surface.points)
+        print(f"illumination: {args.spheres} spheres, {args.cameras} views of {args.size}x{args.size}, {args.steps} steps, Chamfer distance "
+              f"{before:.4f} before ({len(old_sides)} spheres seen), {after:.4f} after ({len(sides)} seen; the rest do not count)")
+        document |= {"figures": {"before": before, "after": after}, "counts": {"before": len(old_sides), "after": len(sides)},
+                     "spheres": args.spheres, "steps": args.steps, "relocated": moved,
+                     "note": "the targets are tsplat's own: spheres at points on the mesh, in the same shading; only spheres that are seen count"}
+        normals = (normalize(last[..., :3], dim=-1) / 2 + 0.5) * (last[..., 3:] > 0.5)
+        write_rows(args.picture, [shade(first), shade(last), normals], views.images[:5])
     return before, after
 
 

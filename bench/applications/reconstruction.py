@@ -25,6 +25,10 @@ class Result:
     spheres: Spheres
     history: list[tuple[str, int, float]]
 
+    def document(self) -> dict[str, dict[str, float]]:
+        """Figures and counts of a report."""
+        return {"figures": {name: quality for name, _, quality in self.history}, "counts": {name: count for name, count, _ in self.history}}
+
 
 def random_volume(count: int, stage: Stage, generator: torch.Generator, overlap: float = 1.0) -> Spheres:
     """Half-transparent grey spheres at random in the stage's ball; `overlap` times as large as if they filled it side by side."""

@@ -1,15 +1,17 @@
-"""Shape from silhouettes (Pulsar, section 5.1, Figure 4a): 1352 spheres on a sphere become an airplane, by plain L1.
+"""Shape from silhouettes (Pulsar, section 5.1, Figure 4a): 1352 spheres on a sphere become an airplane, by L1 on the images.
 
     python bench/applications/silhouettes.py
 
-SoftRas's airplane: 120 silhouettes of 64x64 pixels, of which every eighth is held out. The start is SoftRas's: a cube of 15x15 squares a side,
-blown up to a sphere, 1352 vertices. Spheres that the loss makes vanish are put beside others a few times. Prints the mean intersection
-over union of held-out silhouettes. The picture: what the spheres make of these, and the spheres, shaded by depth.
+SoftRas's airplane: 120 silhouettes of 64x64 pixels, of which every eighth is held out. The paper starts with a sphere at each vertex of the mesh
+that SoftRas starts with. The mesh of that name in the data has only 642 vertices, and SoftRas's result beside it, 1352; so the start is a sphere
+of our own with as many: the vertices of a cube of 15x15 squares a side, blown up. L1 is all of the loss, but not all that happens: the steps
+are done in rounds, and between these, spheres that vanished (opacity below 0.1, or smaller than a quarter of a pixel) are put beside random
+others. Prints the mean intersection over union of held-out silhouettes, of the start and in the end, and how many spheres moved in
+this way. The picture: what the spheres make of these silhouettes, and the spheres, shaded by depth.
 """
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import numpy as np
@@ -22,6 +24,7 @@ import tsplat
 FOV = 30.0
 HOLD_OUT = 8
 SEGMENTS = 15
+GOAL = 0.90
 RADIUS = 1.0                # of a ball around the airplane
 LEAST_RADIUS = 0.006        # a quarter of a pixel
 GAMMA = 1.0, 0.5
@@ -54,33 +57,40 @@ def iou(image: Tensor, target: Tensor) -> float:
 
 def main(argv: list[str] | None = None) -> float:
     """Optimise, print and draw."""
-    parser = arguments(__doc__, "silhouettes.png", steps=1200, rounds=6, batch=4, segments=SEGMENTS)
+    parser = arguments(__doc__, "silhouettes", steps=1200, rounds=6, batch=4, segments=SEGMENTS)
     args = parser.parse_args(argv)
-    start, generator = time.process_time(), torch.Generator().manual_seed(args.seed)
-    views = load(args.data / "softras_airplane" / "softras_airplane.npz")
-    held_out = torch.arange(len(views)) % HOLD_OUT == HOLD_OUT // 2
-    train, test = views[~held_out], views[held_out]
-    positions = 0.5 * cube_sphere(args.segments)
-    n = len(positions)
-    spheres = Spheres.of(positions, torch.full((n,), 0.6 / args.segments), torch.ones(n, 1), torch.full((n,), 0.5))
-    stage = Stage(torch.zeros(3), RADIUS, 2.732, torch.zeros(1))
+    generator = torch.Generator().manual_seed(args.seed)
+    with report(args, "held-out IoU", GOAL) as document:
+        views = load(args.data / "softras_airplane" / "softras_airplane.npz")
+        held_out = torch.arange(len(views)) % HOLD_OUT == HOLD_OUT // 2
+        train, test = views[~held_out], views[held_out]
+        positions = 0.5 * cube_sphere(args.segments)
+        n = len(positions)
+        spheres = Spheres.of(positions, torch.full((n,), 0.6 / args.segments), torch.ones(n, 1), torch.full((n,), 0.5))
+        stage = Stage(torch.zeros(3), RADIUS, 2.732, torch.zeros(1))
 
-    def loss(spheres: Spheres, some: Views, gamma: float) -> Tensor:
-        image = stage.render(spheres, some.cameras, gamma, torch.ones(n, 1))
-        return (image - some.images).abs().mean()
+        def loss(spheres: Spheres, some: Views, gamma: float) -> Tensor:
+            image = stage.render(spheres, some.cameras, gamma, torch.ones(n, 1))
+            return (image - some.images).abs().mean()
 
-    def alive(spheres: Spheres) -> Tensor:
-        return (spheres.opacities > 0.1) & (spheres.radii > LEAST_RADIUS)
+        def alive(spheres: Spheres) -> Tensor:
+            return (spheres.opacities > 0.1) & (spheres.radii > LEAST_RADIUS)
 
-    spheres = optimise_and_relocate(spheres, train, loss, alive, rounds=args.rounds, steps=args.steps, size=RADIUS, speed=5.0, batch=args.batch,
-                                    gamma=GAMMA, generator=generator, name="silhouettes")
-    with torch.no_grad():
-        images = stage.render(spheres, test.cameras, GAMMA[1])
-        score = sum(map(iou, images, test.images)) / len(test)
-        print(f"silhouettes: {n} spheres, {args.steps} steps, held-out IoU {score:.4f} of {len(test)} views")
-        draw(args.picture, stage, spheres, test[torch.arange(0, len(test), 2)[:6]], args.targets)
-    report(start, args.picture)
-    return score
+        @torch.no_grad()
+        def score(spheres: Spheres) -> float:
+            return sum(map(iou, stage.render(spheres, test.cameras, GAMMA[1]), test.images)) / len(test)
+
+        first = score(spheres)
+        spheres, moved = optimise_and_relocate(spheres, train, loss, alive, rounds=args.rounds, steps=args.steps, size=RADIUS, speed=5.0,
+                                               batch=args.batch, gamma=GAMMA, generator=generator, name="silhouettes")
+        last = score(spheres)
+        print(f"silhouettes: {n} spheres, {args.steps} steps, held-out IoU {last:.4f} of {len(test)} views ({first:.4f} at first), "
+              f"{moved} spheres relocated between {args.rounds} rounds")
+        document |= {"figures": {"start": first, "end": last}, "spheres": n, "steps": args.steps, "relocated": moved,
+                     "note": f"the loss is L1 alone; between {args.rounds} rounds, spheres that vanished are put beside others"}
+        with torch.no_grad():
+            draw(args.picture, stage, spheres, test[torch.arange(0, len(test), 2)[:6]], args.targets)
+    return last
 
 
 def draw(path: Path, stage: Stage, spheres: Spheres, views: Views, targets: bool) -> None:

@@ -10,10 +10,8 @@ views: plain colours, the network's.
 
 from __future__ import annotations
 
-import time
-
 import torch
-from common import Spheres, Stage, Views, arguments, load_views, mean_psnr, optimise, report, write_rows
+from common import PSNR, Spheres, Stage, Views, arguments, load_views, mean_psnr, optimise, report, write_rows
 from reconstruction import reconstruct
 from torch import Tensor, nn
 
@@ -60,44 +58,49 @@ class Plain(nn.Module):
 
 def main(argv: list[str] | None = None) -> tuple[float, float]:
     """Reconstruct, go on in both ways, print and draw."""
-    parser = arguments(__doc__, "view_dependent.png", steps=250, batch=1, volume=4000, refinements=2, downscale=4.0, reach=1.0)
+    parser = arguments(__doc__, "view_dependent", steps=250, batch=1, volume=4000, refinements=2, downscale=4.0, reach=1.0)
     args = parser.parse_args(argv)
-    start, generator = time.process_time(), torch.Generator().manual_seed(args.seed)
-    torch.manual_seed(args.seed)                                                            # of the network's weights
-    background = torch.tensor(BACKGROUND)
-    train, test = load_views(args.data / "nerf_synthetic_chair", args.downscale, background)
+    generator = torch.Generator().manual_seed(args.seed)
+    with report(args, PSNR) as document:
+        torch.manual_seed(args.seed)                                                            # of the network's weights
+        background = torch.tensor(BACKGROUND)
+        train, test = load_views(args.data / "nerf_synthetic_chair", args.downscale, background)
 
-    def stage_of(channels: int) -> Stage:
-        return Stage(torch.zeros(3), RADIUS, DISTANCE, torch.cat([background, torch.zeros(channels - 3)]), fade_below=0.5)
+        def stage_of(channels: int) -> Stage:
+            return Stage(torch.zeros(3), RADIUS, DISTANCE, torch.cat([background, torch.zeros(channels - 3)]), fade_below=0.5)
 
-    geometry = reconstruct(stage_of(3), train, test, volume=args.volume, refinements=args.refinements, steps=args.steps, batch=args.batch,
-                           reach=args.reach, generator=generator, say=lambda line: print(f"chair, {line}", flush=True)).spheres
+        result = reconstruct(stage_of(3), train, test, volume=args.volume, refinements=args.refinements, steps=args.steps, batch=args.batch,
+                             reach=args.reach, generator=generator, say=lambda line: print(f"chair, {line}", flush=True))
+        geometry = result.spheres
 
-    def fit(shader: nn.Module, channels: int) -> tuple[Stage, Spheres, float]:
-        stage = stage_of(channels)
-        extra = 0.1 * torch.randn(len(geometry), channels - 3, generator=generator)
-        spheres = geometry.with_features(torch.cat([geometry.features.detach(), extra], 1))
-        groups = [*spheres.groups(RADIUS / 4, SPEED), {"params": list(shader.parameters()), "lr": 5e-3}]
-        batches = torch.Generator().manual_seed(args.seed)                                  # the same for both
+        def fit(shader: nn.Module, channels: int) -> tuple[Stage, Spheres, float]:
+            stage = stage_of(channels)
+            extra = 0.1 * torch.randn(len(geometry), channels - 3, generator=generator)
+            spheres = geometry.with_features(torch.cat([geometry.features.detach(), extra], 1))
+            groups = [*spheres.groups(RADIUS / 4, SPEED), {"params": list(shader.parameters()), "lr": 5e-3}]
+            batches = torch.Generator().manual_seed(args.seed)                                  # the same for both
 
-        def loss(some: Views, gamma: float) -> Tensor:
-            return (shader(stage.render(spheres, some.cameras, gamma), some.cameras) - some.images).square().mean()
+            def loss(some: Views, gamma: float) -> Tensor:
+                return (shader(stage.render(spheres, some.cameras, gamma), some.cameras) - some.images).square().mean()
 
-        optimise([group for group in groups if group["params"]], train, loss, steps=args.steps, batch=args.batch, gamma=(GAMMA, GAMMA),
-                 generator=batches, name=type(shader).__name__)
-        return stage, spheres, mean_psnr(lambda camera: shader(stage.render(spheres, camera, GAMMA), camera), test)
+            optimise([group for group in groups if group["params"]], train, loss, steps=args.steps, batch=args.batch, gamma=(GAMMA, GAMMA),
+                     generator=batches, name=type(shader).__name__)
+            return stage, spheres, mean_psnr(lambda camera: shader(stage.render(spheres, camera, GAMMA), camera), test)
 
-    shaders = Plain(), Shader(FEATURES)
-    results = [fit(shader, channels) for shader, channels in zip(shaders, (3, FEATURES), strict=True)]
-    without, with_ = (quality for _, _, quality in results)
-    print(f"view-dependent shading: {len(geometry)} spheres, held-out PSNR {without:.2f} dB with plain colours, {with_:.2f} dB with a network of the "
-          "viewing direction")
-    some = test[torch.arange(0, len(test), 3)[:5]]
-    with torch.no_grad():
-        rows = [[shader(stage.render(spheres, camera, GAMMA), camera) for camera, _ in some.each()]
-                for shader, (stage, spheres, _) in zip(shaders, results, strict=True)]
-    write_rows(args.picture, rows, some.images if args.targets else None)
-    report(start, args.picture)
+        shaders = Plain(), Shader(FEATURES)
+        results = [fit(shader, channels) for shader, channels in zip(shaders, (3, FEATURES), strict=True)]
+        without, with_ = (quality for _, _, quality in results)
+        print(f"view-dependent shading: {len(geometry)} spheres, held-out PSNR {without:.2f} dB with plain colours, {with_:.2f} dB with a network of "
+              "the viewing direction")
+        found = result.document()
+        found["figures"] |= {"plain colours, on": without, "with the network": with_}
+        document |= {**found, "spheres": len(geometry), "steps": args.steps * (args.refinements + 3),
+                     "note": f"the last two from the same geometry by as many steps, at gamma {GAMMA:g}; those before by L1, at gammas of their own"}
+        some = test[torch.arange(0, len(test), 3)[:5]]
+        with torch.no_grad():
+            rows = [[shader(stage.render(spheres, camera, GAMMA), camera) for camera, _ in some.each()]
+                    for shader, (stage, spheres, _) in zip(shaders, results, strict=True)]
+        write_rows(args.picture, rows, some.images if args.targets else None)
     return without, with_
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -38,6 +39,21 @@ def test_silhouettes(application: ModuleType, shared: Path, tmp_path: Path, caps
 
 
 @pytest.mark.parametrize("application", ["silhouettes"], indirect=True)
+def test_document(application: ModuleType, shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """It is all of stdout, has what its figures hold for, and says that a goal is missed."""
+    score = application.main(options(shared, tmp_path, "--steps 4 --rounds 2 --segments 3 --json"))
+    out, err = capsys.readouterr()
+    document = json.loads(out)
+    assert document.keys() == {"application", "measure", "figures", "spheres", "steps", "relocated", "note", "goal", "met", "wall_s", "cpu_s",
+                               "device", "machine", "torch", "threads", "command", "commit", "date"}
+    assert (document["application"], document["spheres"], document["steps"]) == ("silhouettes", 56, 4)
+    assert document["figures"]["end"] == score
+    assert (document["goal"], document["met"]) == (0.9, False)
+    assert document["cpu_s"] > 0
+    assert "silhouettes: goal 0.9 missed" in err
+
+
+@pytest.mark.parametrize("application", ["silhouettes"], indirect=True)
 def test_the_cube_that_is_a_sphere(application: ModuleType) -> None:
     vertices = application.cube_sphere(15)
     assert vertices.shape == (1352, 3)
@@ -46,9 +62,13 @@ def test_the_cube_that_is_a_sphere(application: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("application", ["illumination"], indirect=True)
-def test_illumination(application: ModuleType, shared: Path, tmp_path: Path) -> None:
-    before, after = application.main(options(shared, tmp_path, "--steps 20 --rounds 2 --spheres 150 --samples 1000 --cameras 12 --size 32"))
+def test_illumination(application: ModuleType, shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before, after = application.main(options(shared, tmp_path, "--steps 20 --rounds 2 --spheres 150 --samples 1000 --cameras 12 --size 32 --json"))
     assert after < before
+    document = json.loads(capsys.readouterr().out)
+    assert document["figures"] == {"before": before, "after": after}
+    assert 0 < document["counts"]["after"] <= document["spheres"] == 150
+    assert "goal" not in document
     assert image_size(tmp_path / "picture.png") == (5 * 32, 4 * 32)
 
 
@@ -60,19 +80,22 @@ def test_chamfer_distance(application: ModuleType) -> None:
 
 
 @pytest.mark.parametrize("application", ["head"], indirect=True)
-def test_head_and_its_neural_shading(application: ModuleType, shared: Path, tmp_path: Path) -> None:
+def test_head_and_its_neural_shading(application: ModuleType, shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spheres = tmp_path / "made" / "head.ply"
-    result = application.main(options(shared, tmp_path, f"--steps 8 --volume 200 --refinements 1 --downscale 8 --spheres {spheres}"))
+    result = application.main(options(shared, tmp_path, f"--steps 8 --volume 200 --refinements 1 --downscale 8 --spheres {spheres} --json"))
     names, counts, quality = zip(*result.history, strict=True)
     assert names == ("volume", "volume, pruned", "refinement 1, before", "refinement 1", "refinement 1, pruned")
     assert counts[2] == 12 * counts[1]
     assert quality[3] > quality[2]
     assert len(result.spheres) == counts[4]
+    assert json.loads(capsys.readouterr().out)["figures"] == dict(zip(names, quality, strict=True))
     assert image_size(tmp_path / "picture.png") == (4 * 32, 32)
     shading = importlib.import_module("neural_shading")
-    before, longer, after = shading.main(options(shared, tmp_path, f"--steps 20 --downscale 8 --spheres {spheres}"))
-    assert longer > before
-    assert after > before
+    figures = shading.main(options(shared, tmp_path, f"--steps 20 --downscale 8 --spheres {spheres} --json"))
+    assert json.loads(capsys.readouterr().out)["figures"] == figures
+    before, *after = figures.values()
+    assert before == pytest.approx(quality[4], abs=1e-3)                                # where the head ended
+    assert all(figure > before for figure in after)
     assert image_size(tmp_path / "picture.png") == (4 * 32, 3 * 32)
 
 

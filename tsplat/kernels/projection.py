@@ -345,7 +345,7 @@ def project_backward(means: Tensor, quats: Tensor | None, scales: Tensor | None,
     v_means, (v_quats, v_scales, v_covars) = new(means), (None if x is None else new(x) for x in (quats, scales, covars))
     v_viewmats, v_Ks = (torch.zeros_like(viewmats), torch.zeros_like(Ks)) if cameras else (viewmats.new_empty(0, 4, 4), Ks.new_empty(0, 3, 3))
     if C * N > 0:
-        options = launch("project_backward")
+        options = launch("project_cameras_backward" if cameras or model == "fisheye" else "project_backward")
         programs = ceil_div(N, options["BLOCK"])
         partials = means.new_empty(programs, C, SUMS) if cameras else None
         project_bwd_kernel[(programs,)](

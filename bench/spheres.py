@@ -216,9 +216,9 @@ def markdown(report: dict[str, Any], figure: str | None) -> str:
         cpu = "" if gpu else f"{1e3 * forward['cpu']:.0f} / {1e3 * backward['cpu']:.0f}"
         fwd, bwd, both = (f"{1e3 * row[name]['wall']:.{2 if gpu else 0}f}" if name in row else "" for name in ("forward", "backward", "both"))
         lines.append(f"| {row['part']} | {row['spheres']:,} | {row['radius']:.4g} | {row['width']}x{row['height']} | {row['tolerance']:g} | "
-                     f"{row['hits'] / 1e6:.2f} | {row['pairs'] / 1e6:.0f} | {row['times']} | {fwd} | {bwd} | {both} | {cpu} | {goals(row, report['device'])} | "
-                     f"{row['pairs'] / forward[clock] / 1e6:.0f} | {row['pairs'] / backward[clock] / 1e6:.0f} | {row['forward_MiB']:.0f} | "
-                     f"{row['both_MiB']:.0f} |")
+                     f"{row['hits'] / 1e6:.2f} | {row['pairs'] / 1e6:.0f} | {row['times']} | {fwd} | {bwd} | {both} | {cpu} | "
+                     f"{goals(row, report['device'])} | {row['pairs'] / forward[clock] / 1e6:.0f} | {row['pairs'] / backward[clock] / 1e6:.0f} | "
+                     f"{row['forward_MiB']:.0f} | {row['both_MiB']:.0f} |")
     return "\n".join([*lines, *(["", f"![time over number of spheres]({figure})"] if figure else [])]) + "\n"
 
 

@@ -32,7 +32,7 @@ from tsplat.viewer.page import Page, training_page  # noqa: E402
 
 Wait = Callable[..., None]
 WIDTH, HEIGHT = 800, 480
-SEEN = (slice(160, HEIGHT), slice(0, 440))       # rows and columns that no control or notice of the page covers
+SEEN = (slice(220, HEIGHT), slice(0, 440))       # rows and columns that no control or notice of the page covers, whatever the fonts
 LEVELS = 1.2
 """Mean difference of screen and render, in 1/255: JPEG leaves up to 0.94 on these pictures; three pixels to the side are 1.3 and more."""
 SWITCHES = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run", "--disable-background-networking",
@@ -77,11 +77,13 @@ class Screen:
         self.until(lambda: self.differs(want) < LEVELS, what)
 
     def slide(self, label: str, part: float) -> float:
-        """Click on a slider, so far along it, and return its value."""
+        """Click on a slider, so far along it, where it is not yet, and return its new value."""
         slider = self._input(label)
-        box = slider.bounding_box()
+        thumb, box = slider.locator("[role=slider]"), slider.bounding_box()
+        before = thumb.get_attribute("aria-valuenow")
         slider.click(position={"x": part * box["width"], "y": box["height"] / 2})
-        return float(slider.locator("[role=slider]").get_attribute("aria-valuenow"))
+        self.until(lambda: thumb.get_attribute("aria-valuenow") != before, f"another value of {label}")
+        return float(thumb.get_attribute("aria-valuenow"))
 
     def choose(self, label: str, option: str) -> None:
         """Choose from a list."""

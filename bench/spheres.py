@@ -207,7 +207,7 @@ def markdown(report: dict[str, Any], figure: str | None) -> str:
     """The report as a table."""
     gpu, clock = report["device"] != "cpu", report["clock"]
     lines = [f"# Spheres: {report['machine']}, {report['date']}, commit {report['commit']}", "",
-             f"`{report['command']}`, torch {report['torch']}, float32, {'CUDA events' if gpu else str(report['threads']) + ' threads'}, "
+             f"`{report['command']}`, torch {report['torch']}, float32, {'CUDA events' if gpu else str(report['threads']) + ' threads'}. "
              f"{BUSY if clock == 'cpu' else ''}What is measured stands at the head of `bench/spheres.py`.", "",
              "| set-up | spheres | radius | size | tolerance | hits (M) | pairs (M) | repetitions | fwd ms | bwd ms | both ms | CPU ms, fwd / bwd "
              "| goals, wall ms | fwd M pairs/s | bwd M pairs/s | fwd MiB | fwd+bwd MiB |", "| --- " * 17 + "|"]

@@ -98,29 +98,24 @@ def single_threaded() -> Iterator[None]:
 
     Each thread with parallel operations has OpenMP threads of its own, as long as it lives. If there are more of these than cores, OpenMP (GNU's)
     no longer lets them spin while they wait for each other, but sleep: everything in the process takes up to twice as long.
+
+    Threads that look at their setting (`torch.get_num_threads`) in the block for the first time are so for good.
     """
-    before = _take_one_thread()
+    before = torch.get_num_threads()    # a thread's first look takes over the process's setting, so it comes before its own setting
+    torch.set_num_threads(1)            # each thread's own, but for threads that have not looked yet
     try:
         yield
     finally:
         torch.set_num_threads(before)
 
 
-def _take_one_thread() -> int:
-    """For this thread, and those yet to come; returns how many it was."""
-    before = torch.get_num_threads()    # a thread's first look takes over the process's setting, so it comes before its own setting
-    torch.set_num_threads(1)
-    return before
-
-
 def single_threaded_pool(threads: int, name: str) -> ThreadPoolExecutor:
-    """Threads whose operations are single-threaded; see `single_threaded`."""
-    others = torch.get_num_threads()
-    pool = ThreadPoolExecutor(threads, name, initializer=_take_one_thread)
+    """Threads whose operations are single-threaded (see `single_threaded`); the setting of all others, and of those yet to come, stays."""
+    pool = ThreadPoolExecutor(threads, name, initializer=torch.get_num_threads)
     started = threading.Barrier(threads)
-    for future in [pool.submit(started.wait) for _ in range(threads)]:
-        future.result()
-    torch.set_num_threads(others)                       # that of threads yet to come
+    with single_threaded():
+        for future in [pool.submit(started.wait) for _ in range(threads)]:
+            future.result()
     return pool
 
 

@@ -91,7 +91,7 @@ def test_a_picture_that_fails_does_not_end_the_others(loop: RenderLoop, gaussian
 @pytest.mark.parametrize("one_core", [False, True])
 def test_only_one_thread_draws_on_all_cores(one_core: bool, gaussians: Gaussians, wait: Wait, monkeypatch: pytest.MonkeyPatch) -> None:
     """A second one would make both slower: each takes OpenMP threads of its own. None does beside a fit."""
-    cores, drawn = 2, []
+    cores, drawn, others = 2, [], list[int]()
 
     def draw(*args: Any) -> Any:
         drawn.append((threading.current_thread().name, torch.get_num_threads()))
@@ -107,10 +107,14 @@ def test_only_one_thread_draws_on_all_cores(one_core: bool, gaussians: Gaussians
             loop.wish(eye.visitor, wish())
             wait(eye.sharp(wish()), "the sharp picture")
             loop.sharp(wish())
+            other = threading.Thread(target=lambda: others.append(torch.get_num_threads()))
+            other.start()
+            other.join()
         assert torch.get_num_threads() == cores
     finally:
         torch.set_num_threads(before)
     assert set(drawn) == {("viewer", 1 if one_core else cores), (threading.current_thread().name, 1)}
+    assert others == [cores]                                 # of a fit in a thread that has not computed yet, too
 
 
 def test_the_thread_ends(gaussians: Gaussians) -> None:

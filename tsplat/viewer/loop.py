@@ -9,6 +9,7 @@ import traceback
 from collections.abc import Callable
 from types import TracebackType
 
+import torch
 from tsplat_reference.parallel import single_threaded
 
 from tsplat.pictures.modes import Scene
@@ -26,13 +27,15 @@ class RenderLoop:
     """
 
     def __init__(self, *, one_core: bool = False) -> None:
-        self._one_core = one_core
         self._schedule = Schedule()
         self._scene: Scene | None = None
         self._changed = threading.Condition()
         self._closed = False
+        self._looked = threading.Event()
         self._thread = threading.Thread(target=self._run, name="viewer", daemon=True)
-        self._thread.start()
+        with single_threaded() if one_core else contextlib.nullcontext():
+            self._thread.start()
+            self._looked.wait()
 
     def enter(self, show: Callable[[Frame], None]) -> Visitor:
         """A page was opened. Its `show` is called in the thread that draws."""
@@ -98,10 +101,8 @@ class RenderLoop:
         self.close()
 
     def _run(self) -> None:
-        with single_threaded() if self._one_core else contextlib.nullcontext():
-            self._draw()
-
-    def _draw(self) -> None:
+        torch.get_num_threads()                       # now, that of this moment is this thread's
+        self._looked.set()
         while (work := self._next()) is not None:
             job, scene = work
             begin = time.perf_counter()

@@ -46,12 +46,12 @@ def noise(width: int, height: int, generator: torch.Generator) -> Tensor:
 
 def make_capture(folder: Path, photos: int, size: tuple[int, int]) -> Path:
     """Write a transforms.json, files of that size, and as many links to them as there are `photos`."""
-    from kornia.io import write_image
+    from kornia_rs.io import write_image_jpeg
 
     (folder / "images").mkdir()
     generator = torch.Generator().manual_seed(0)
     for i in range(FILES):
-        write_image(folder / f"{i}.jpg", noise(*size, generator))
+        write_image_jpeg(str(folder / f"{i}.jpg"), noise(*size, generator).permute(1, 2, 0).contiguous().numpy(), "rgb", 80)
     frames = []
     for i in range(photos):
         name = f"images/{i:04d}.jpg"

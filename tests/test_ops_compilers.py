@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import pytest
 import scenes
@@ -14,6 +14,7 @@ from compare import assert_close, assert_same_bits, gradients, leaves
 from op_cases import HEIGHT, WIDTH, case, render, render_arguments
 from torch import Tensor
 from torch._dynamo.testing import CompileCounterWithBackend
+from torch.autograd import forward_ad
 
 import tsplat
 from tsplat import Camera, ops
@@ -88,6 +89,33 @@ def test_density_control_gets_its_gradients_from_compiled_code(backend: Backend,
     assert_close(got, want, 1e-14)
     assert bool((want[1] >= want[0].abs() * (1 - 1e-12)).all())
     assert bool((want[0] != 0).any())
+
+
+@pytest.mark.parametrize("fullgraph", [False, True])
+@pytest.mark.parametrize("way", ["dual numbers come in", "dual numbers within", "jvp", "jacfwd"])
+@pytest.mark.usefixtures("fresh_dynamo")
+def test_forward_mode_is_an_error_in_compiled_code(backend: Backend, way: str, fullgraph: bool) -> None:
+    """Zeros, or no tangent at all, would be silent nonsense. A first call, without tangents, is compiled and stays of use."""
+    first, *others = [a.detach() for a in render_arguments(backend)]
+
+    def shot(means: Tensor) -> Tensor:
+        return render(means, *others)[0].mean()
+
+    def dual(function: Callable[[Tensor], Tensor], x: Tensor) -> Tensor | None:
+        with forward_ad.dual_level():
+            tangent: Tensor | None = forward_ad.unpack_dual(function(forward_ad.make_dual(x, torch.ones_like(x)))).tangent
+            return tangent
+
+    compiled = torch.compile(shot, fullgraph=fullgraph, backend="aot_eager")
+    want = compiled(first)
+    calls: dict[str, Callable[[Tensor], object]] = {
+        "dual numbers come in": lambda x: dual(compiled, x),
+        "dual numbers within": torch.compile(lambda x: dual(shot, x), fullgraph=fullgraph, backend="aot_eager"),
+        "jvp": torch.compile(lambda x: torch.func.jvp(shot, (x,), (torch.ones_like(x),)), fullgraph=fullgraph, backend="aot_eager"),
+        "jacfwd": torch.compile(torch.func.jacfwd(shot), fullgraph=fullgraph, backend="aot_eager")}
+    with pytest.raises((NotImplementedError, torch._dynamo.exc.Unsupported), match="tsplat: project has no forward-mode derivative"):
+        calls[way](first)
+    assert torch.equal(compiled(first), want)
 
 
 @pytest.mark.usefixtures("fresh_dynamo")

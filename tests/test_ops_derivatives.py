@@ -7,7 +7,7 @@ import torch
 import tsplat_reference as reference
 from backends import Backend
 from compare import assert_close, assert_same_bits
-from op_cases import DIFFERENTIABLE, WITH_GRADIENT, case, differentiable_case, render, render_arguments, require_grad
+from op_cases import CASES, DIFFERENTIABLE, WITH_GRADIENT, case, differentiable_case, render, render_arguments, require_grad
 from torch import Tensor
 from torch.autograd import forward_ad, gradcheck, gradgradcheck
 
@@ -64,6 +64,24 @@ def test_forward_mode_is_an_error_not_silence(backend: Backend, name: str) -> No
     for i in range(len(inputs)):
         with forward_ad.dual_level(), pytest.raises(NotImplementedError, match="no forward-mode derivative"):
             call(*(forward_ad.make_dual(x, torch.ones_like(x)) if i == j else x for j, x in enumerate(inputs)))
+
+
+@pytest.mark.parametrize("name", [name for name in CASES if "N = 0" not in name])
+def test_forward_mode_is_an_error_in_the_dispatcher_too(backend: Backend, name: str) -> None:
+    """As `torch.ops.tsplat.*`, which code that was compiled or exported calls; with gradients and without, by dual numbers and by `torch.func`."""
+    op, args = case(name, backend)
+    call = getattr(torch.ops.tsplat, op.name)
+    for i in [i for i, x in enumerate(args) if isinstance(x, Tensor) and x.is_floating_point()]:
+        def of_one(x: Tensor, i: int = i) -> object:
+            return call(*args[:i], x, *args[i + 1:])
+
+        with forward_ad.dual_level():
+            of_one(args[i])                                                 # no tangent, no error
+            for x in (args[i], args[i].clone().requires_grad_()):
+                with pytest.raises(NotImplementedError, match=f"tsplat: {op.name} has no forward-mode derivative"):
+                    of_one(forward_ad.make_dual(x, torch.ones_like(x)))
+        with pytest.raises(NotImplementedError, match=f"tsplat: {op.name} has no forward-mode derivative"):
+            torch.func.jvp(of_one, (args[i],), (torch.ones_like(args[i]),))
 
 
 def test_the_forward_mode_error_recommends_what_works(backend: Backend) -> None:

@@ -1,12 +1,14 @@
 """Image files and the store: alpha, masks, sizes, the bound on memory, broken files."""
 
+import struct
+import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 import torch
-from kornia.io import write_image as kornia_write
+from kornia_rs import io as codecs
 from torch import Tensor
 
 from tsplat.scene import ImageStore, Photo, read_image, write_image
@@ -45,22 +47,64 @@ def test_write_refuses(tmp_path: Path) -> None:
 
 
 def test_other_files(tmp_path: Path, ramp: Ramp) -> None:
-    planes = (ramp(20, 12) * 255).to(torch.uint8).permute(2, 0, 1).contiguous()
-    kornia_write(tmp_path / "a.jpg", planes, quality=95)
-    kornia_write(tmp_path / "grey.jpg", planes[:1].contiguous())
-    kornia_write(tmp_path / "a.tif", planes)
-    kornia_write(tmp_path / "deep.png", planes.to(torch.uint16) * 257)
+    pixels = (ramp(20, 12) * 255).to(torch.uint8).numpy()
+    codecs.write_image_jpeg(str(tmp_path / "a.jpg"), pixels, "rgb", 95)
+    codecs.write_image_jpeg(str(tmp_path / "grey.jpg"), pixels[..., :1].copy(), "mono", 95)
+    codecs.write_image_tiff_u8(str(tmp_path / "a.tif"), pixels, "rgb")
+    codecs.write_image_png_u16(str(tmp_path / "deep.png"), pixels.astype("uint16") * 257, "rgb")
     for name in ("a.jpg", "grey.jpg", "a.tif", "deep.png"):
         assert image_size(tmp_path / name) == (20, 12)
         assert read_image(tmp_path / name).shape == (12, 20, 3)
     padded = (tmp_path / "a.jpg").read_bytes()
     (tmp_path / "padded.jpg").write_bytes(padded[:2] + b"\xff\xff" + padded[2:])      # fill bytes before a marker
     assert image_size(tmp_path / "padded.jpg") == (20, 12)
-    kornia_write(tmp_path / "float.tif", ramp(20, 12).permute(2, 0, 1).contiguous())
+    codecs.write_image_tiff_f32(str(tmp_path / "float.tif"), ramp(20, 12).numpy(), "rgb")
     with pytest.raises(ValueError, match=r"float\.tif: expected"):
         read_image(tmp_path / "float.tif")
     for name in ("a.tif", "deep.png"):
-        assert torch.equal(read_image(tmp_path / name), planes.permute(1, 2, 0))
+        assert torch.equal(read_image(tmp_path / name), torch.from_numpy(pixels))
+    assert abs(read_image(tmp_path / "grey.jpg").numpy().astype(int) - pixels[..., :1]).max() <= 6
+
+
+GREY, RGB, INDEXED, GREY_ALPHA = 0, 2, 3, 4                         # colour types of PNG
+
+
+def png(width: int, depth: int, kind: int, pixels: bytes, **chunks: bytes) -> bytes:
+    """A file of one row, with chunks before it."""
+    def chunk(name: bytes, body: bytes) -> bytes:
+        return struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+
+    every = {"IHDR": struct.pack(">IIBBBBB", width, 1, depth, kind, 0, 0, 0), **chunks, "IDAT": zlib.compress(b"\0" + pixels), "IEND": b""}
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunk(name.encode(), body) for name, body in every.items())
+
+
+COLORS = bytes((10, 20, 30, 40, 50, 60, 70, 80, 90))
+A, B = (10, 20, 30), (70, 80, 90)
+
+
+@pytest.mark.parametrize(("file", "pixels"), [
+    (png(2, 8, INDEXED, b"\0\2", PLTE=COLORS), [A, B]),
+    (png(2, 8, INDEXED, b"\0\2", tEXt=b"a\0b", PLTE=COLORS, tRNS=b"\x07"), [(*A, 7), (*B, 255)]),
+    (png(2, 8, GREY, b"\x0a\x14", tRNS=b"\0\x0a"), [(10, 10, 10, 0), (20, 20, 20, 255)]),
+    (png(2, 8, RGB, bytes(A + B), tRNS=bytes((0, 70, 0, 80, 0, 90))), [(*A, 255), (*B, 0)]),
+    (png(2, 8, RGB, bytes(A + B), tRNS=bytes((0, 70, 0, 80, 0, 91))), [(*A, 255), (*B, 255)]),
+    (png(2, 8, RGB, bytes(A + B), PLTE=COLORS), [A, B]),
+    (png(2, 16, GREY, bytes((10, 10, 20, 20)), tRNS=bytes((20, 20))), [(10, 10, 10, 255), (20, 20, 20, 0)]),
+    (png(2, 16, GREY, bytes((10, 10, 20, 20)), tRNS=bytes((20, 21))), [(10, 10, 10, 255), (20, 20, 20, 255)])],
+    ids=["palette", "palette with alpha", "grey key", "RGB key", "another key", "a suggested palette", "deep key", "another deep key"])
+def test_palettes_and_transparent_colours(tmp_path: Path, file: bytes, pixels: list[tuple[int, ...]]) -> None:
+    (tmp_path / "a.png").write_bytes(file)
+    assert read_image(tmp_path / "a.png").tolist() == [[list(p) for p in pixels]]
+
+
+@pytest.mark.parametrize("file", [
+    png(8, 1, GREY, b"\xaa"), png(2, 8, GREY_ALPHA, bytes(4)), png(2, 8, INDEXED, b"\0\0", PLTE=COLORS[:4]),
+    png(2, 8, INDEXED, b"\0\3", PLTE=COLORS), png(2, 8, INDEXED, b"\0\2", PLTE=COLORS, tRNS=bytes(4))],
+    ids=["one bit", "grey and alpha", "half a colour", "no such colour", "too many alphas"])
+def test_a_png_that_cannot_be_read(tmp_path: Path, file: bytes) -> None:
+    (tmp_path / "a.png").write_bytes(file)
+    with pytest.raises(ValueError, match=r"a\.png: expected an image that can be decoded; \w"):
+        read_image(tmp_path / "a.png")
 
 
 def test_not_an_image(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Poses as parameters: increments in Se3, for the cameras of a fit and for held-out ones with the scene as it is."""
+"""Poses as parameters: increments of them, for the cameras of a fit and for held-out ones with the scene as it is."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ LAST_RATE = 0.01       # of the first
 
 
 def moved(camera: Camera, increment: Tensor, extent: float) -> Camera:
-    """The camera after exp(increment), in its own axes: `[6]`, a shift in units of `extent`, then a rotation in radians.
+    """The camera after an increment `[6]`, in its own axes: a shift in units of `extent` behind a rotation, an axis times radians.
 
     Small numbers of like size for both, so that one learning rate suits them. Differentiable at 0.
     """
-    from kornia.geometry.liegroup import Se3
+    from kornia.geometry.conversions import axis_angle_to_rotation_matrix
 
-    step: Tensor = Se3.exp(torch.cat([increment[:3] * extent, increment[3:]])[None]).matrix()[0]        # [4, 4]
-    if not increment.requires_grad:                                # kornia's Se3 makes parameters of what it is given
-        step = step.detach()
-    return dataclasses.replace(camera, viewmats=step @ camera.viewmats)
+    shift, turn = increment[:3] * extent, increment[3:]
+    rotated = axis_angle_to_rotation_matrix(turn[None])[0] @ camera.viewmats[..., :3, :]
+    viewmats = torch.cat([rotated, camera.viewmats[..., 3:, :]], -2)
+    return dataclasses.replace(camera, viewmats=viewmats + torch.nn.functional.pad(shift[:, None], (3, 0, 0, 1)))
 
 
 def refined(camera: Camera, loss: Callable[[Camera], Tensor], extent: float, steps: int, rate: float) -> Camera:

@@ -15,6 +15,7 @@ from torch.library import custom_op
 
 Maybe = TypeVar("Maybe", Tensor, Tensor | None)
 
+LIBRARY = torch.library.Library("tsplat", "IMPL")
 PLAIN = frozenset((Tensor, torch.nn.Parameter))
 """Tensors that have no `__torch_dispatch__` or `__torch_function__` of their own."""
 
@@ -49,6 +50,7 @@ class Op:
             self.custom.register_autocast(device, torch.float32)
         if vmap:
             self.custom.register_vmap(_looped(self.custom))
+        self._guard_autograd()
 
     def __call__(self, *args: Any) -> Any:
         if torch.compiler.is_compiling():
@@ -85,6 +87,19 @@ class Op:
             args = tuple(a.detach() if isinstance(a, Tensor) else a for a in args)
         return self.custom(*args)
 
+    def _guard_autograd(self) -> None:
+        """Let the dispatcher, too, raise where there is a tangent: compiled code and direct calls do not come by `__call__`."""
+        if _autograd_kernel is None:
+            return
+        kernel = _autograd_kernel(getattr(torch.ops.tsplat, self.name).default, self.custom)
+
+        def guarded(keys: Any, *args: Any) -> Any:
+            if _forward_mode():
+                self._reject_tangents(args)
+            return kernel(keys, *args)
+
+        LIBRARY.impl(self.name, guarded, "Autograd", with_keyset=True, allow_override=True)
+
     def _reject_tangents(self, args: tuple[Any, ...]) -> None:
         """Raise where a tensor carries a forward-mode tangent, which either form would silently drop."""
         for a in args:
@@ -110,6 +125,8 @@ def _forward_mode() -> bool:
 # private, and what torch.autograd.Function itself asks; should a release of torch be without them, all calls are custom ops
 _transforms: Callable[[], bool] = getattr(torch._C, "_are_functorch_transforms_active", lambda: True)
 _modes: Callable[[], int] = getattr(torch._C, "_len_torch_dispatch_stack", lambda: 1)
+# what custom_op registers; that of torch.library.get_kernel calls itself when a mode is active (2.13)
+_autograd_kernel: Callable[..., Callable[..., Any]] | None = getattr(torch._library.autograd, "make_autograd_impl", None)
 
 
 def _alone(args: tuple[Any, ...]) -> bool:

@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from kornia.geometry.quaternion import Quaternion
 
 STEPS = 32                  # of each piece of a path, between which its length is taken for straight
 
@@ -46,9 +43,12 @@ class Poses(NamedTuple):
 
     def mixed(self, other: Poses, part: Tensor) -> Poses:
         """Between two lists of poses, or beyond: `part` `[n]` is 0 at these and 1 at the others. Rotations by slerp (Shoemake 1985)."""
+        from kornia.geometry.conversions import axis_angle_to_quaternion, quaternion_to_axis_angle
         from kornia.geometry.quaternion import Quaternion
 
-        turned: Quaternion = Quaternion(self.quats).slerp(Quaternion(other.quats), part)
+        start = Quaternion(self.quats)              # its slerp takes a list of parts from kornia 0.9 on only, which is not for Python 3.10
+        turn = quaternion_to_axis_angle((start.conj() * Quaternion(other.quats)).data)
+        turned: Quaternion = start * Quaternion(axis_angle_to_quaternion(part[:, None] * turn))
         return Poses(torch.lerp(self.eyes, other.eyes, part[:, None]), turned.data)
 
     def distance(self, other: Poses, unit: float) -> Tensor:

@@ -1,4 +1,8 @@
-"""Single image files: their size without decoding, reading, writing. Decoding is kornia's, imported when first needed."""
+"""Single image files: their size without decoding, reading, writing.
+
+Decoding and encoding is done by kornia_rs, which kornia is built on, imported when first needed. (`kornia.io` itself, in the last version for
+Python 3.10, reads no JPEG with the kornia_rs of today, and writes no alpha.)
+"""
 
 from __future__ import annotations
 
@@ -15,6 +19,7 @@ from tsplat.scene.files import replacing
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 JPEG_SIGNATURE = b"\xff\xd8"
 JPEG_FRAME = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}      # the markers of a segment that holds the size
+MODES = {1: "mono", 3: "rgb", 4: "rgba"}                      # of kornia_rs, by channels
 
 
 def image_size(path: str | os.PathLike[str]) -> tuple[int, int]:
@@ -61,15 +66,14 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
         ValueError: naming the file, if it cannot be decoded.
         FileNotFoundError: it does not exist.
     """
-    from kornia.io import ImageLoadType, load_image
+    from kornia_rs.io import read_image as decode
 
     path = Path(path)
     try:
-        image = load_image(path, ImageLoadType.UNCHANGED)                          # [C, H, W]
-        if image.shape[0] == 1 and image.dtype == torch.uint8:                     # grey, or the indices of a palette
-            image = load_image(path, ImageLoadType.RGBA8)
-            image = image[:3] if (image[3] == 255).all() else image
-    except FileNotFoundError:
+        image = torch.from_numpy(decode(os.fspath(path)))                          # [H, W, C]
+        with path.open("rb") as file:
+            image = _shown(image, *_png_tables(file))
+    except OSError:
         raise
     except Exception as error:                                                     # kornia_rs raises bare exceptions too
         raise ValueError(f"{path}: expected an image that can be decoded; {error}") from None
@@ -77,7 +81,37 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
         image = (image.to(torch.float32) / 257).round().to(torch.uint8)
     if image.dtype != torch.uint8:
         raise ValueError(f"{path}: expected 8 or 16 bits per channel; got {image.dtype}")
-    return image.expand(3, -1, -1).permute(1, 2, 0) if image.shape[0] == 1 else image.permute(1, 2, 0)
+    return image.expand(-1, -1, 3) if image.shape[2] == 1 else image
+
+
+def _png_tables(file: BinaryIO) -> tuple[bytes, bytes]:
+    """What PLTE and tRNS of a PNG contain, which come before its pixels; empty where they are not there, or the file is no PNG."""
+    tables = {b"PLTE": b"", b"tRNS": b""}
+    if file.read(8) == PNG_SIGNATURE:
+        while len(head := file.read(8)) == 8 and head[4:] != b"IDAT":
+            size = int.from_bytes(head[:4], "big")
+            if head[4:] in tables:
+                tables[head[4:]] = file.read(size)
+                size = 0
+            file.seek(size + 4, os.SEEK_CUR)                  # and the checksum, which the decoder has tested
+    return tables[b"PLTE"], tables[b"tRNS"]
+
+
+def _shown(image: Tensor, palette: bytes, transparency: bytes) -> Tensor:
+    """The pixels `[H, W, C]` of a PNG as it means them (PNG specification, 11.2.2 and 11.3.1.1): an index has a colour of the palette and its
+    alpha, where it is listed; else the transparent colour, of 16 bits per channel, has alpha 0. A palette of RGB images is a mere hint.
+    """
+    if palette and image.shape[2] == 1:
+        colors = torch.tensor(list(palette), dtype=torch.uint8).view(-1, 3)
+        table = torch.cat([colors, torch.full_like(colors[:, :1], 255)], 1)
+        table[:len(transparency), 3] = torch.tensor(list(transparency), dtype=torch.uint8)
+        return table[image[..., 0].long()][..., :4 if transparency else 3]
+    if len(transparency) == 2 * image.shape[2]:
+        key = torch.tensor([int.from_bytes(transparency[i:i + 2], "big") for i in range(0, len(transparency), 2)])
+        opaque = (image.to(torch.int32) != key).any(2, keepdim=True)
+        alpha = opaque.to(torch.int32) * (255 if image.dtype == torch.uint8 else 65535)
+        return torch.cat([image.expand(-1, -1, 3), alpha.to(image.dtype)], 2)
+    return image
 
 
 def write_image(path: str | os.PathLike[str], image: Tensor) -> None:
@@ -94,18 +128,18 @@ def write_image(path: str | os.PathLike[str], image: Tensor) -> None:
     """
     path = Path(path)
     check_tensor("image", image, ("H", "W", "C"))
-    if image.shape[2] not in (1, 3, 4) or not image.numel():
+    if image.shape[2] not in MODES or not image.numel():
         raise ValueError(f"image: expected [H, W, 1], [H, W, 3] or [H, W, 4] with pixels; got {list(image.shape)}")
     if path.suffix.lower() != ".png":
         raise ValueError(f"{path}: expected a file name that ends in .png; got {path.suffix!r}")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"{path}: expected the folder {path.parent} to exist")
 
-    from kornia.io import write_image as write
+    from kornia_rs.io import write_image_png_u8
 
     with replacing(path) as temporary:
         try:
-            write(temporary, to_bytes(image).permute(2, 0, 1).contiguous())
+            write_image_png_u8(os.fspath(temporary), to_bytes(image).contiguous().numpy(), MODES[image.shape[2]])
         except Exception as error:                                                 # kornia_rs raises bare exceptions
             raise OSError(f"{path}: cannot be written; {error}") from None
 

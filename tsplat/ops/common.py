@@ -15,7 +15,7 @@ from torch.library import custom_op
 
 Maybe = TypeVar("Maybe", Tensor, Tensor | None)
 
-LIBRARY = torch.library.Library("tsplat", "IMPL")
+LIBRARY = torch.library.Library("tsplat", "IMPL")  # type: ignore[no-untyped-call]
 PLAIN = frozenset((Tensor, torch.nn.Parameter))
 """Tensors that have no `__torch_dispatch__` or `__torch_function__` of their own."""
 
@@ -98,7 +98,7 @@ class Op:
                 self._reject_tangents(args)
             return kernel(keys, *args)
 
-        LIBRARY.impl(self.name, guarded, "Autograd", with_keyset=True, allow_override=True)
+        LIBRARY.impl(self.name, guarded, "Autograd", with_keyset=True, allow_override=True)  # type: ignore[no-untyped-call]
 
     def _reject_tangents(self, args: tuple[Any, ...]) -> None:
         """Raise where a tensor carries a forward-mode tangent, which either form would silently drop."""

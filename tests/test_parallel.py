@@ -180,19 +180,19 @@ def test_a_forked_process_starts_workers_of_its_own() -> None:
 FAULTS = """
 import resource, torch, tsplat_reference
 torch.set_num_threads(1)
-def faults():
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
-    [torch.ones(1_500_000) for _ in range(8)]
-    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
-faults()
-print(faults() + faults())
+before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+for mb in range(4, 31, 2):
+    torch.ones(mb << 18)
+print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)
 """
 
 
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="it is glibc whose freed memory goes back to the system")
 def test_freed_memory_stays_with_the_process() -> None:
-    """Eight arrays are 11,719 pages. Made again twice, they have 1,500 to 8,800 faults, or 13,000 to 22,000, were freed memory given back."""
+    """Arrays of 4 to 30 MB, each larger than what glibc has learnt of, are 60,900 pages, and so many faults were freed memory given back; else 8,600
+    to 30,800, by what else is on the heap.
+    """
     environment = {**{k: v for k, v in os.environ.items() if not k.startswith(("MALLOC_", "GLIBC_"))},
                    "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "reference")])}
     run = subprocess.run([sys.executable, "-W", "ignore", "-c", FAULTS], env=environment, timeout=60, check=True, capture_output=True, text=True)
-    assert int(run.stdout) < 11_000
+    assert int(run.stdout) < 45_000

@@ -193,7 +193,7 @@ def fisheye_terms(x, y, z):
     """
     TERMS: tl.constexpr = 12 if x.dtype == tl.float64 else 7
     r2 = x * x + y * y
-    near_axis = r2 < SERIES_BELOW * (z * z)
+    near_axis = r2 < (z * z) * SERIES_BELOW             # in this order: the interpreter of Triton 3.7 cannot multiply a constexpr by a tensor
     off_r2 = tl.where(near_axis, 1.0, r2)
     w = 1.0 / (r2 + z * z)
     iz = 1.0 / z

@@ -65,21 +65,14 @@ class Lens:
 
     def project(self, rays: Tensor) -> Tensor:
         """Pixels `[..., 2]` where the lens shows the points `[..., 2]` of the plane z = 1."""
-        square = rays.square().sum(-1, keepdim=True)                         # r^2
+        from kornia.geometry.calibration import distort_points
+        from kornia.geometry.camera.distortion_kannala_brandt import distort_points_kannala_brandt
+
         if self.fisheye:
-            radius = square.sqrt()
-            angle = radius.atan()
-            k1, k2, k3, k4 = self.distortion or (0.0,) * 4
-            a2 = angle.square()
-            bent = angle * (1 + a2 * (k1 + a2 * (k2 + a2 * (k3 + a2 * k4))))
-            rays = rays * torch.where(radius > 0, bent / radius.clamp(min=1e-12), 1.0)
-        elif self.distortion:
-            k1, k2, p1, p2, k3, k4, k5, k6 = self.distortion
-            radial = (1 + square * (k1 + square * (k2 + square * k3))) / (1 + square * (k4 + square * (k5 + square * k6)))
-            product = 2 * rays.prod(-1, keepdim=True)                        # 2 x y
-            tangential = product * rays.new_tensor([p1, p2]) + (square + 2 * rays.square()) * rays.new_tensor([p2, p1])
-            rays = rays * radial + tangential
-        return rays * rays.new_tensor([self.fx, self.fy]) + rays.new_tensor([self.cx, self.cy])
+            return distort_points_kannala_brandt(rays, rays.new_tensor([self.fx, self.fy, self.cx, self.cy, *(self.distortion or (0.0,) * 4)]))
+        focal, centre = rays.new_tensor([self.fx, self.fy]), rays.new_tensor([self.cx, self.cy])
+        pixels = rays * focal + centre
+        return distort_points(pixels, self.K.to(rays), rays.new_tensor(self.distortion)) if self.distortion else pixels
 
     def undistorted(self) -> Lens:
         """The pinhole lens of the same size and principal point, zoomed in just so far that it sees nothing outside the photo.

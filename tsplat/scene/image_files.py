@@ -64,17 +64,15 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
 
     Raises:
         ValueError: naming the file, if it cannot be decoded.
-        FileNotFoundError: it does not exist.
+        OSError: it cannot be opened.
     """
     from kornia_rs.io import read_image as decode
 
     path = Path(path)
+    with path.open("rb") as file:
+        tables = _png_tables(file)
     try:
-        image = torch.from_numpy(decode(os.fspath(path)))                          # [H, W, C]
-        with path.open("rb") as file:
-            image = _shown(image, *_png_tables(file))
-    except OSError:
-        raise
+        image = _shown(torch.from_numpy(decode(os.fspath(path))), *tables)         # [H, W, C]
     except Exception as error:                                                     # kornia_rs raises bare exceptions too
         raise ValueError(f"{path}: expected an image that can be decoded; {error}") from None
     if image.dtype == torch.uint16:
@@ -93,7 +91,7 @@ def _png_tables(file: BinaryIO) -> tuple[bytes, bytes]:
             if head[4:] in tables:
                 tables[head[4:]] = file.read(size)
                 size = 0
-            file.seek(size + 4, os.SEEK_CUR)                  # and the checksum, which the decoder has tested
+            file.seek(size + 4, os.SEEK_CUR)                  # and the checksum, which the decoder tests
     return tables[b"PLTE"], tables[b"tRNS"]
 
 

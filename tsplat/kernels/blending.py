@@ -87,19 +87,15 @@ def add_where(shown, total, value, PREDICATES: tl.constexpr):
     return tl.where(shown, total + value, total) if PREDICATES else total + value
 
 
-@triton.jit
-def without_last(w, T, behind, T_MIN: tl.constexpr):
-    """Without the splat that would take the transmittance to T_MIN or below: there the pixel is finished, with T negative as a sign of it."""
-    last = (w > 0) & (behind <= T_MIN)
-    return tl.where(last, 0.0, w), tl.where(last, -T, T)
-
-
 @Launcher
 @triton.jit(do_not_specialize=["W", "H", "tiles_x", "tiles_y", "null"])
 def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, W, H, tiles_x, tiles_y, null, D: tl.constexpr,
                      BACKGROUND: tl.constexpr, ALPHA_MAX: tl.constexpr, DROP_LAST: tl.constexpr, log2_alpha: tl.constexpr,
                      LANES: tl.constexpr, PTX: tl.constexpr, PREDICATES: tl.constexpr):
-    """Image `[C, H, W, D]` and alpha `[C, H, W]` of a block of tiles."""
+    """Image `[C, H, W, D]` and alpha `[C, H, W]` of a block of tiles.
+
+    DROP_LAST: T takes in the splat that finishes a pixel, too, but nothing else does, so alpha is the sum of the weights instead of 1 - T.
+    """
     view, tile, exists, left, top, x, y, column4, pixel4 = block_pixels(tl.program_id(0), lane_x, tiles_x, tiles_y, W, H, LANES)
     cx = left.to(x.dtype) + TILE / 2
     T = glue(tl.where(column4 < W, T_ONE, 0.0), tl.where(column4 + 1 < W, T_ONE, 0.0)) + x * 0.0     # beyond the border finished
@@ -107,6 +103,7 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
     C1 = x * 0.0
     C2 = x * 0.0
     C3 = x * 0.0
+    A = x * 0.0
     start, hits, longest = tile_list(offsets, tile, exists)
     i = 0
     batch = load_batch(ids, start, 0, hits, null)
@@ -118,9 +115,14 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
         while u < TILE:                                                 # a loop: unrolled, it takes more registers and is no faster
             splat = of_batch(batch, u, ids, start, i, hits, null, PTX)
             r = load_record(records, splat, D)
-            w, shown = forward_weight(r[0] - cx, r[1], r[2], r[3], r[4], r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX and not DROP_LAST, PREDICATES)
+            w, shown = forward_weight(r[0] - cx, r[1], r[2], r[3], r[4], r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX, PREDICATES)
+            T = add_where(shown, T, w * -2**-BOOST, PREDICATES)
             if DROP_LAST:
-                w, T = without_last(w, T, T - w * 2**-BOOST, T_END)
+                if PREDICATES:
+                    shown = shown & (T > T_END)
+                else:
+                    w = tl.where(T > T_END, w, 0.0)
+                A = add_where(shown, A, w, PREDICATES)
             C0 = add_where(shown, C0, r[6] * w, PREDICATES)
             if D > 1:
                 C1 = add_where(shown, C1, r[7] * w, PREDICATES)
@@ -128,14 +130,13 @@ def blend_fwd_kernel(records, ids, offsets, backgrounds, image, alphas, lane_x, 
                 C2 = add_where(shown, C2, r[8] * w, PREDICATES)
             if D > 3:
                 C3 = add_where(shown, C3, r[9] * w, PREDICATES)
-            T = add_where(shown, T, w * -2**-BOOST, PREDICATES)
             u += 1
         i += TILE
         batch = following
         following = later
         longest = tl.where(tl.max(tl.max(T, 1), 0) > T_END, longest, 0)     # finished tiles are only looked for once per batch
     if DROP_LAST:
-        T = tl.abs(T)
+        T = T_ONE - A * 2**-BOOST
     T *= tl.full((), 1 / T_ONE, x.dtype)                # in float32, too, 1 where no splat is
     unit = tl.full((), 2**-BOOST / T_ONE, x.dtype)
     C0 *= unit
@@ -208,8 +209,9 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
             l00, l10, l11 = r[2:5]
             alpha = splat_alpha(mx, my, l00, l10, l11, r[5], x, y, T, log2_alpha, ALPHA_MAX, PTX)
             w = alpha * T
+            T -= w
             if DROP_LAST:
-                w, T = without_last(w, T, T - w, T_MIN)
+                w = tl.where(T > T_MIN, w, 0.0)
             g = v_weight + r[6] * v0
             if D > 1:
                 g += r[7] * v1
@@ -218,7 +220,6 @@ def blend_bwd_kernel(records, ids, offsets, backgrounds, image, alphas, v_image,
             if D > 3:
                 g += r[9] * v3
             rest -= w * g
-            T -= w
             if PTX:
                 reciprocal = tl.inline_asm_elementwise("rcp.approx.ftz.f32 $0, $1;", "=f,f", [T], dtype=tl.float32, is_pure=True, pack=1)
             else:
@@ -282,7 +283,7 @@ def blend(means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, ba
     has_background = backgrounds is not None
     if s.D <= CHANNELS:
         blend_fwd_kernel[(s.blocks,)](s.records, s.ids, s.offsets, s.backgrounds, image, alphas, s.lane_x, width, height, *s.grid, s.R,
-                                     BACKGROUND=has_background, PREDICATES=s.predicates and not drop_last, **launch("blend"), **s.warp)
+                                     BACKGROUND=has_background, PREDICATES=s.predicates, **launch("blend"), **s.warp)
     else:
         options = launch("features")
         feature_fwd_kernel[(s.tiles, ceil_div(s.D, options["DB"]))](

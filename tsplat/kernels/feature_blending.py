@@ -49,7 +49,7 @@ def chunk_weights(records, ids, i, end, null, x, y, cx, cy, T, log2_alpha: tl.co
     front = behind / (1.0 - alpha)
     counts = (behind if DROP_LAST else front) > T_MIN
     after = tl.min(tl.where(counts, behind, T[:, None]), 1)
-    if DROP_LAST:                                                       # negative: finished, as in `blend_fwd_kernel`
+    if DROP_LAST:                                                       # negative: finished by a splat that does not count
         after = tl.where((tl.min(behind, 1) <= T_MIN) & (T > T_MIN), -after, after)
     alpha = tl.where(counts, alpha, 0.0)
     return splat, mx, my, l00, l10, l11, alpha, front * alpha, after

@@ -139,7 +139,8 @@ class Model(torch.nn.Module):
 
     def forward(self, viewmats: Tensor, Ks: Tensor) -> Tensor:
         """The image."""
-        return tsplat.rasterize(*self.parameters_, Camera(viewmats, Ks, WIDTH, HEIGHT), sh_degree=1).image
+        means, quats, scales, opacities, sh = (self.parameters_[i] for i in range(5))
+        return tsplat.rasterize(means, quats, scales, opacities, sh, Camera(viewmats, Ks, WIDTH, HEIGHT), sh_degree=1).image
 
 
 @pytest.mark.parametrize("strict", [False, True])

@@ -1,4 +1,4 @@
-"""The numbers that decide what is drawn; one home for the reference, and for the kernels, which get them as arguments."""
+"""The numbers that decide what is drawn; one home for the reference and the kernels."""
 
 import math
 

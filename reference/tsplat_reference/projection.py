@@ -310,7 +310,8 @@ def _extents(a: Tensor, c: Tensor, opacities: Tensor) -> tuple[Tensor, Tensor]:
     """Half sizes of the box in which alpha can reach ALPHA_MIN: ceil(e sigma), e = sqrt(2 ln(255 o)), which is 3.33 for an opaque splat."""
     e = (2 * torch.log(opacities.clamp_min(ALPHA_MIN) / ALPHA_MIN)).sqrt()
     e = torch.where(opacities >= ALPHA_MIN, e, 0.0)
-    rx, ry = ((e * v.clamp(0.0, 1e18).sqrt()).ceil().clamp_max(2.0**30) for v in (a, c))
+    largest = torch.finfo(a.dtype).max                       # of float16 less than these
+    rx, ry = ((e * v.clamp(0.0, min(1e18, largest)).sqrt()).ceil().clamp_max(min(2.0**30, largest)) for v in (a, c))
     return rx, ry
 
 

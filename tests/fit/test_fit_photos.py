@@ -31,7 +31,7 @@ def test_increment_is_a_shift_and_a_rotation_in_the_cameras_axes() -> None:
     assert torch.equal(moved(camera, torch.zeros(6), 2.0).viewmats, camera.viewmats)
     shifted = moved(camera, torch.tensor([0.5, 0, 0, 0, 0, 0]), 2.0)
     torch.testing.assert_close(shifted.viewmats[:3, 3] - camera.viewmats[:3, 3], torch.tensor([1.0, 0, 0]))
-    turned = moved(camera, torch.tensor([0, 0, 0, 0, 0, torch.pi / 2]), 2.0)
+    turned = moved(camera, torch.tensor([0, 0, 0, 0, 0, 2.0]), 2.0)                        # 2 tan(90 degrees / 2)
     torch.testing.assert_close(turned.viewmats[:3, :3] @ torch.eye(3)[0], torch.tensor([0.0, 1, 0]), atol=1e-6, rtol=0)
 
 

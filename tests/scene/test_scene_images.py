@@ -66,7 +66,7 @@ def test_other_files(tmp_path: Path, ramp: Ramp) -> None:
     assert abs(read_image(tmp_path / "grey.jpg").numpy().astype(int) - pixels[..., :1]).max() <= 6
 
 
-GREY, RGB, INDEXED, GREY_ALPHA = 0, 2, 3, 4                         # colour types of PNG
+GREY, RGB, INDEXED, GREY_ALPHA, RGBA = 0, 2, 3, 4, 6                # colour types of PNG
 
 
 def png(width: int, depth: int, kind: int, pixels: bytes, **chunks: bytes) -> bytes:
@@ -89,9 +89,12 @@ A, B = (10, 20, 30), (70, 80, 90)
     (png(2, 8, RGB, bytes(A + B), tRNS=bytes((0, 70, 0, 80, 0, 90))), [(*A, 255), (*B, 0)]),
     (png(2, 8, RGB, bytes(A + B), tRNS=bytes((0, 70, 0, 80, 0, 91))), [(*A, 255), (*B, 255)]),
     (png(2, 8, RGB, bytes(A + B), PLTE=COLORS), [A, B]),
+    (png(2, 8, GREY, b"\0\2", PLTE=COLORS), [(0, 0, 0), (2, 2, 2)]),
+    (png(2, 8, RGBA, bytes((*A, 1, *B, 2)), tRNS=bytes(8)), [(*A, 1), (*B, 2)]),
     (png(2, 16, GREY, bytes((10, 10, 20, 20)), tRNS=bytes((20, 20))), [(10, 10, 10, 255), (20, 20, 20, 0)]),
     (png(2, 16, GREY, bytes((10, 10, 20, 20)), tRNS=bytes((20, 21))), [(10, 10, 10, 255), (20, 20, 20, 255)])],
-    ids=["palette", "palette with alpha", "grey key", "RGB key", "another key", "a suggested palette", "deep key", "another deep key"])
+    ids=["palette", "palette with alpha", "grey key", "RGB key", "another key", "a suggested palette", "a palette of greys",
+         "a key beside alpha", "deep key", "another deep key"])
 def test_palettes_and_transparent_colours(tmp_path: Path, file: bytes, pixels: list[tuple[int, ...]]) -> None:
     (tmp_path / "a.png").write_bytes(file)
     assert read_image(tmp_path / "a.png").tolist() == [[list(p) for p in pixels]]
@@ -110,20 +113,26 @@ def test_a_png_that_cannot_be_read(tmp_path: Path, file: bytes) -> None:
 def test_not_an_image(tmp_path: Path) -> None:
     write_image(tmp_path / "whole.png", torch.rand(40, 40, 3))
     whole = (tmp_path / "whole.png").read_bytes()
+    codecs.write_image_jpeg(str(tmp_path / "whole.jpg"), torch.randint(256, (80, 80, 3), dtype=torch.uint8).numpy(), "rgb", 95)
+    photo = (tmp_path / "whole.jpg").read_bytes()
     contents = {"a.png": b"no image", "a.jpg": b"no image", "empty.jpg": b"", "a.xyz": b"no image",
-                "cut.jpg": b"\xff\xd8\xff\xe0\x00\x04ab", "cut.png": whole[:len(whole) // 2]}
+                "cut.jpg": b"\xff\xd8\xff\xe0\x00\x04ab", "cut.png": whole[:len(whole) // 2], "half.jpg": photo[:len(photo) // 2],
+                "spoilt.jpg": photo[:len(photo) // 2] + bytes(200) + photo[len(photo) // 2 + 200:],
+                "huge.png": whole[:33] + b"\xff\xff\xff\xffPLTEabc"}
     for name, content in contents.items():
         path = tmp_path / name
         path.write_bytes(content)
         with pytest.raises(ValueError, match=name):
             read_image(path)
-        if name != "cut.png":
+        if name not in ("cut.png", "half.jpg", "spoilt.jpg", "huge.png"):          # whose sizes are there
             with pytest.raises(ValueError, match=name):
                 image_size(path)
         with pytest.raises(ValueError, match=name):
             ImageStore([Photo(path, 4, 4)])[0]
     with pytest.raises(FileNotFoundError):
         read_image(tmp_path / "absent.png")
+    with pytest.raises(IsADirectoryError):
+        read_image(tmp_path)
 
 
 @pytest.mark.parametrize("factor", [1, 2, 3, 1.5, 4])

@@ -14,14 +14,15 @@ LAST_RATE = 0.01       # of the first
 
 
 def moved(camera: Camera, increment: Tensor, extent: float) -> Camera:
-    """The camera after an increment `[6]`, in its own axes: a shift in units of `extent` behind a rotation, an axis times radians.
+    """The camera after an increment `[6]`, in its own axes: a shift in units of `extent` behind a rotation.
 
-    Small numbers of like size for both, so that one learning rate suits them. Differentiable at 0.
+    That is about its axis by 2 atan(length / 2), nearly the length in radians (Rodrigues' parameters, doubled): differentiable at 0, where kornia 0.8
+    has NaN for angles. Small numbers of like size for both, so that one learning rate suits them.
     """
-    from kornia.geometry.conversions import axis_angle_to_rotation_matrix
+    from kornia.geometry.conversions import quaternion_to_rotation_matrix
 
     shift, turn = increment[:3] * extent, increment[3:]
-    rotated = axis_angle_to_rotation_matrix(turn[None])[0] @ camera.viewmats[..., :3, :]
+    rotated = quaternion_to_rotation_matrix(torch.cat([torch.ones_like(turn[:1]), turn / 2])) @ camera.viewmats[..., :3, :]
     viewmats = torch.cat([rotated, camera.viewmats[..., 3:, :]], -2)
     return dataclasses.replace(camera, viewmats=viewmats + torch.nn.functional.pad(shift[:, None], (3, 0, 0, 1)))
 

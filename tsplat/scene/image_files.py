@@ -17,6 +17,8 @@ from tsplat.checks import check_tensor
 from tsplat.scene.files import replacing
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+PNG_COLOR_KIND = 25                                           # where in the file the colour type is
+PNG_OPAQUE, PNG_INDEXED = (0, 2), 3                           # of these: grey, RGB; palette
 JPEG_SIGNATURE = b"\xff\xd8"
 JPEG_FRAME = set(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}      # the markers of a segment that holds the size
 MODES = {1: "mono", 3: "rgb", 4: "rgba"}                      # of kornia_rs, by channels
@@ -66,13 +68,20 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
         ValueError: naming the file, if it cannot be decoded.
         OSError: it cannot be opened.
     """
-    from kornia_rs.io import read_image as decode
+    from kornia_rs import io
 
     path = Path(path)
-    with path.open("rb") as file:
-        tables = _png_tables(file)
     try:
-        image = _shown(torch.from_numpy(decode(os.fspath(path))), *tables)         # [H, W, C]
+        with path.open("rb") as file:
+            head = file.read(PNG_COLOR_KIND + 1)
+            decode = io.read_image_jpegturbo if head.startswith(JPEG_SIGNATURE) else io.read_image     # which makes up what a JPEG lacks
+            image = torch.from_numpy(decode(os.fspath(path)))                      # [H, W, C]
+            if head.startswith(PNG_SIGNATURE):
+                image = _shown(image, head[PNG_COLOR_KIND], *_png_tables(file))
+    except OSError as error:
+        if error.errno is not None:                                                # else it is of the decoder, about what is in the file
+            raise
+        raise ValueError(f"{path}: expected an image that can be decoded; {error}") from None
     except Exception as error:                                                     # kornia_rs raises bare exceptions too
         raise ValueError(f"{path}: expected an image that can be decoded; {error}") from None
     if image.dtype == torch.uint16:
@@ -83,28 +92,27 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
 
 
 def _png_tables(file: BinaryIO) -> tuple[bytes, bytes]:
-    """What PLTE and tRNS of a PNG contain, which come before its pixels; empty where they are not there, or the file is no PNG."""
+    """What PLTE and tRNS of a PNG contain, which come before its pixels; empty where they are not there. (Decoded, so its checksums are right.)"""
     tables = {b"PLTE": b"", b"tRNS": b""}
-    if file.read(8) == PNG_SIGNATURE:
-        while len(head := file.read(8)) == 8 and head[4:] != b"IDAT":
-            size = int.from_bytes(head[:4], "big")
-            if head[4:] in tables:
-                tables[head[4:]] = file.read(size)
-                size = 0
-            file.seek(size + 4, os.SEEK_CUR)                  # and the checksum, which the decoder tests
+    file.seek(len(PNG_SIGNATURE))
+    while len(head := file.read(8)) == 8 and head[4:] != b"IDAT":
+        body = file.tell() + int.from_bytes(head[:4], "big")
+        if head[4:] in tables:
+            tables[head[4:]] = file.read(body - file.tell())
+        file.seek(body + 4)
     return tables[b"PLTE"], tables[b"tRNS"]
 
 
-def _shown(image: Tensor, palette: bytes, transparency: bytes) -> Tensor:
-    """The pixels `[H, W, C]` of a PNG as it means them (PNG specification, 11.2.2 and 11.3.1.1): an index has a colour of the palette and its
-    alpha, where it is listed; else the transparent colour, of 16 bits per channel, has alpha 0. A palette of RGB images is a mere hint.
+def _shown(image: Tensor, kind: int, palette: bytes, transparency: bytes) -> Tensor:
+    """The pixels `[H, W, C]` of a PNG of this colour type as it means them (PNG specification, 11.2.2 and 11.3.1.1): an index has a colour of the
+    palette and its alpha, where it is listed; of grey and RGB the transparent colour, of 16 bits per channel, has alpha 0.
     """
-    if palette and image.shape[2] == 1:
+    if kind == PNG_INDEXED:
         colors = torch.tensor(list(palette), dtype=torch.uint8).view(-1, 3)
         table = torch.cat([colors, torch.full_like(colors[:, :1], 255)], 1)
         table[:len(transparency), 3] = torch.tensor(list(transparency), dtype=torch.uint8)
         return table[image[..., 0].long()][..., :4 if transparency else 3]
-    if len(transparency) == 2 * image.shape[2]:
+    if kind in PNG_OPAQUE and len(transparency) == 2 * image.shape[2]:
         key = torch.tensor([int.from_bytes(transparency[i:i + 2], "big") for i in range(0, len(transparency), 2)])
         opaque = (image.to(torch.int32) != key).any(2, keepdim=True)
         alpha = opaque.to(torch.int32) * (255 if image.dtype == torch.uint8 else 65535)

@@ -148,7 +148,7 @@ def _between(limits: Floats, part: Floats) -> Floats:
 
 def _packed(values: Floats, bits: tuple[int, ...]) -> NDArray[np.int64]:
     """Values `[N, n]` in 0..1 as whole numbers of so many bits, the first in the highest bits."""
-    word = np.zeros(len(values), np.int64)
+    word: NDArray[np.int64] = np.zeros(len(values), np.int64)
     for i, width in enumerate(bits):
         largest = (1 << width) - 1
         word = word << width | rounded(values[:, i] * largest, largest)

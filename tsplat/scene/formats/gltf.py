@@ -240,7 +240,7 @@ def _read_accessor(document: Json, binary: Reader, accessor: Json, kind: str) ->
         raise accessor.wrong(f"expected {count} rows of {row} bytes, {stride} apart, from byte {first} of a view of {size} bytes")
     if not count:
         return np.empty((0, width), np.float32)
-    values = np.ndarray((count, width), dtype, binary.data, start + first, (stride, dtype.itemsize)).astype(np.float32)
+    values: Floats = np.ndarray((count, width), dtype, binary.data, start + first, (stride, dtype.itemsize)).astype(np.float32)
     if accessor.get("normalized", bool, False) and component != FLOAT:
         values = np.maximum(values / np.iinfo(dtype).max, -1)
     return values

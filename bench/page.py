@@ -48,11 +48,21 @@ GPU: Columns = {
     "fwd+bwd": lambda r: f"{r['gsplat']['both'][0]:.2f}" if "both" in r["gsplat"] else "none",
     "times as fast": lambda r: f"{r['gsplat']['both'][0] / r['ms']['both'][0]:.2f}" if "both" in r["gsplat"] else "",
 }
-CPU: Columns = {
+GROWTH: Columns = {
     "size": lambda r: f"{r['width']}x{r['height']}",
     "splats": lambda r: f"{r['n']:,}",
     "forward ms": lambda r: f"{r['forward_ms']:.0f}",
     "fwd+bwd ms": lambda r: f"{r['both_ms']:.0f}",
+}
+LARGE: Columns = {
+    **{name: GROWTH[name] for name in ("size", "splats")},
+    "fwd+bwd s": lambda r: f"{r['seconds']:.1f}",
+    "GiB of the process": lambda r: f"{r['peak_bytes'] / 2**30:.2f}",
+    "of them before": lambda r: f"{r['before_bytes'] / 2**30:.2f}",
+}
+CPU: Columns = {
+    **GROWTH,
+    "pairs per exp": lambda r: f"{r['pairs'] / r['forward_exps']:.3f} / {r['pairs'] / r['both_exps']:.3f}",
     "rival's, scaled": lambda r: " / ".join(f"{ms:.0f}" for ms in r["rival_ms"]),
     "ours over rival's": lambda r: f"{r['forward_ms'] / r['rival_ms'][0]:.2f} / {r['both_ms'] / r['rival_ms'][1]:.2f}",
 }
@@ -137,8 +147,10 @@ def sections(report: Row) -> list[tuple[str, Columns, list[Row]]]:
     kinds = (("gsplat", "Gaussians on a GPU, beside gsplat", GPU), ("rival_ms", "Gaussians on a CPU", CPU), ("part", "Spheres", SPHERES),
              ("ranks", "Many processes", DISTRIBUTED), ("without", "Scenes in host memory", OFFLOAD),
              ("streamed", f"Streaming photos of {report.get('width')}x{report.get('height')}, {report.get('all_MiB', 0):,.0f} MiB in all", PHOTOS))
-    return [(title + (f", commit {report['commit']}" if "commit" in report else ""), columns, rows)
-            for key, title, columns in kinds if rows and key in rows[0]]
+    found = [(title, columns, rows) for key, title, columns in kinds if rows and key in rows[0]]
+    found += [(title, columns, report[key] if isinstance(report[key], list) else [report[key]]) for key, title, columns in (
+        ("growth", "Gaussians on a CPU, as splats and pixels grow", GROWTH), ("large", "Gaussians on a CPU, memory", LARGE)) if key in report]
+    return [(title + (f", commit {report['commit']}" if "commit" in report else ""), columns, rows) for title, columns, rows in found]
 
 
 def table(columns: Columns, rows: list[Row]) -> list[str]:

@@ -31,7 +31,8 @@ def picture(dtype: torch.dtype, model: str) -> list[Tensor]:
         p.means2d, p.conics, each, colors, None, *bins, image, alpha, torch.ones_like(image), None, *sizes, False, False)
     v = reference.project_backward(means, quats, scales, None, viewmats, Ks, WIDTH, HEIGHT, model, 0.3, True, p.radii, v_means2d,
                                    torch.ones_like(p.depths), v_conics, torch.ones_like(p.depths))
-    return [plain, image, alpha, v_opacities, *reference.harmonics_backward(means, centers, coeffs, 4, seen, v_colors), *(x for x in v if x is not None)]
+    v_colors = reference.harmonics_backward(means, centers, coeffs, 4, seen, v_colors)
+    return [plain, image, alpha, v_opacities, *v_colors, *(x for x in v if x is not None)]
 
 
 @pytest.mark.parametrize("model", ["pinhole", "orthographic", "fisheye"])

@@ -89,9 +89,10 @@ class Op:
 
     def _guard_autograd(self) -> None:
         """Let the dispatcher, too, raise where there is a tangent: compiled code and direct calls do not come by `__call__`."""
-        if _autograd_kernel is None:
+        try:
+            kernel = _autograd_kernel(getattr(torch.ops.tsplat, self.name).default, self.custom)
+        except TypeError:                                   # not there, or not as it was
             return
-        kernel = _autograd_kernel(getattr(torch.ops.tsplat, self.name).default, self.custom)
 
         def guarded(keys: Any, *args: Any) -> Any:
             if _forward_mode():
@@ -126,7 +127,7 @@ def _forward_mode() -> bool:
 _transforms: Callable[[], bool] = getattr(torch._C, "_are_functorch_transforms_active", lambda: True)
 _modes: Callable[[], int] = getattr(torch._C, "_len_torch_dispatch_stack", lambda: 1)
 # what custom_op registers; that of torch.library.get_kernel calls itself when a mode is active (2.13)
-_autograd_kernel: Callable[..., Callable[..., Any]] | None = getattr(torch._library.autograd, "make_autograd_impl", None)
+_autograd_kernel: Any = getattr(torch._library.autograd, "make_autograd_impl", None)
 
 
 def _alone(args: tuple[Any, ...]) -> bool:

@@ -1,7 +1,7 @@
 """What is minimised and what is measured: L1, SSIM and PSNR of a render against a photo, depth, and regularisers.
 
-SSIM (Wang et al. 2004) has an 11x11 Gaussian window of sigma 1.5, per channel, as kornia's, which takes five times as long on a CPU.
-Images are padded with zeros, as the 3DGS code does, so that figures compare with its and images of any size have one.
+SSIM (Wang et al. 2004) has an 11x11 Gaussian window of sigma 1.5, per channel, as `kornia.metrics.ssim`, by kornia's filters. Images are padded
+with zeros, as the 3DGS code does, so that figures compare with its and images of any size have one.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
-from torch.nn.functional import conv2d, interpolate
+from torch.nn.functional import interpolate
 
 from tsplat.fit.ranks import ALONE, Ranks
 
@@ -133,22 +133,17 @@ def ssim(image: Tensor, target: Target) -> Tensor:
 def ssim_map(a: Tensor, b: Tensor) -> Tensor:
     """Structural similarity `[H, W, 3]` of two images `[H, W, 3]`, of any size, with zeros around them.
 
-    With gradient it takes a fifth of the time of kornia's, whose convolutions are of single channels, five for each.
+    All means at once, in a third to half of the time of `kornia.metrics.ssim`, which takes one after the other.
     """
+    from kornia.filters import filter2d_separable, get_gaussian_kernel1d
+
+    window = get_gaussian_kernel1d(WINDOW, SIGMA, device=a.device, dtype=a.dtype)
     a, b = (image.permute(2, 0, 1)[None] for image in (a, b))                                   # [1, 3, H, W]
-    mean_a, mean_b, squares, product = _blurred(torch.cat([a, b, a * a + b * b, a * b], 1)).chunk(4, 1)
+    mean_a, mean_b, squares, product = filter2d_separable(torch.cat([a, b, a * a + b * b, a * b], 1), window, window, "constant").chunk(4, 1)
     mean_product, mean_squares = mean_a * mean_b, mean_a * mean_a + mean_b * mean_b
     covariance, variances = product - mean_product, squares - mean_squares
     similarity = (2 * mean_product + C1) * (2 * covariance + C2) / ((mean_squares + C1) * (variances + C2))
     return similarity[0].permute(1, 2, 0)
-
-
-def _blurred(planes: Tensor) -> Tensor:
-    """Means of `[1, C, H, W]` in the window."""
-    offsets = torch.arange(WINDOW, dtype=planes.dtype, device=planes.device) - WINDOW // 2
-    window = torch.softmax(-offsets.square() / (2 * SIGMA**2), 0).expand(planes.shape[1], 1, 1, -1)
-    planes = conv2d(planes, window.mT, padding=(WINDOW // 2, 0), groups=planes.shape[1])
-    return conv2d(planes, window, padding=(0, WINDOW // 2), groups=planes.shape[1])
 
 
 def _reduced(image: Tensor, width: int, height: int) -> Tensor:

@@ -96,12 +96,13 @@ def test_forward_and_backward_agree_with_the_reference(name: str) -> None:
     assert_close([g.cpu() for g in v_got], v_want, 1e-12)
 
 
+@pytest.mark.parametrize("drop_last", [False, True])
 @pytest.mark.parametrize("predicates", [False, True])
-def test_splats_that_are_not_shown_are_left_out_either_way(monkeypatch: pytest.MonkeyPatch, predicates: bool) -> None:
+def test_splats_that_are_not_shown_are_left_out_either_way(monkeypatch: pytest.MonkeyPatch, predicates: bool, drop_last: bool) -> None:
     """By a weight of 0, or by a predicate of the sums: one for some targets, one for the others."""
     target = dataclasses.replace(blending.current_target(), predicates=predicates)
     monkeypatch.setattr(blending, "current_target", lambda: target)
-    c = case(1, 20, 21, 17, channels=4, device=DEVICE)
+    c = case(1, 40, 21, 17, channels=4, device=DEVICE, drop_last=drop_last, size=(2.0, 9.0), opacity=(0.3, 0.999))
     want = reference.blend_blocks(*(x.cpu() if isinstance(x, Tensor) else x for x in c.arguments))
     assert_close([g.cpu() for g in blending.blend(*c.arguments)], want, 1e-12)
 

@@ -259,7 +259,6 @@ def test_spz_is_written_as_others_do(data_root: Path, playbot: Gaussians, tmp_pa
 
 
 def test_real_sog(data_root: Path, playbot: Gaussians) -> None:
-    pytest.importorskip("kornia")
     for path in ("playbot_lod3_31k_sog", "playbot_lod3_31k_sog/meta.json"):          # the .ply was made of it
         loaded = Gaussians.load(data_root / "splats" / path)
         agree(loaded, playbot, means=0, log_scales=0, opacities=ROUNDING, sh0=0, sh_rest=0, quats=ROUNDING)

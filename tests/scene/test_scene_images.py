@@ -63,7 +63,8 @@ def test_other_files(tmp_path: Path, ramp: Ramp) -> None:
         read_image(tmp_path / "float.tif")
     for name in ("a.tif", "deep.png"):
         assert torch.equal(read_image(tmp_path / name), torch.from_numpy(pixels))
-    assert abs(read_image(tmp_path / "grey.jpg").numpy().astype(int) - pixels[..., :1]).max() <= 6
+    # it changes along x alone; of a block, quality 95 rounds the cosines to steps of 2, 1, 1, 2, 2, 4, 5 and 6: by 2 at most, and whole numbers by 1
+    assert abs(read_image(tmp_path / "grey.jpg").numpy().astype(int) - pixels[..., :1]).max() <= 3
 
 
 GREY, RGB, INDEXED, GREY_ALPHA, RGBA = 0, 2, 3, 4, 6                # colour types of PNG

@@ -71,19 +71,16 @@ def read_image(path: str | os.PathLike[str]) -> Tensor:
     from kornia_rs import io
 
     path = Path(path)
-    try:
-        with path.open("rb") as file:
+    with path.open("rb") as file:
+        try:
             head = file.read(PNG_COLOR_KIND + 1)
-            decode = io.read_image_jpegturbo if head.startswith(JPEG_SIGNATURE) else io.read_image     # which makes up what a JPEG lacks
+            # `read_image` makes up what a JPEG lacks
+            decode = io.read_image_jpegturbo if head.startswith(JPEG_SIGNATURE) else io.read_image
             image = torch.from_numpy(decode(os.fspath(path)))                      # [H, W, C]
             if head.startswith(PNG_SIGNATURE):
                 image = _shown(image, head[PNG_COLOR_KIND], *_png_tables(file))
-    except OSError as error:
-        if error.errno is not None:                                                # else it is of the decoder, about what is in the file
-            raise
-        raise ValueError(f"{path}: expected an image that can be decoded; {error}") from None
-    except Exception as error:                                                     # kornia_rs raises bare exceptions too
-        raise ValueError(f"{path}: expected an image that can be decoded; {error}") from None
+        except Exception as error:                                                 # kornia_rs raises bare exceptions, and OSErrors about contents
+            raise ValueError(f"{path}: expected an image that can be decoded; {error}") from None
     if image.dtype == torch.uint16:
         image = (image.to(torch.float32) / 257).round().to(torch.uint8)
     if image.dtype != torch.uint8:

@@ -64,15 +64,15 @@ class Lens:
         return abs(width * self.height - height * self.width) <= self.width + self.height
 
     def project(self, rays: Tensor) -> Tensor:
-        """Pixels `[..., 2]` where the lens shows the points `[..., 2]` of the plane z = 1."""
+        """Pixels `[..., 2]` where the lens shows the points `[..., 2]` of the plane z = 1: OpenCV's models, as kornia has them."""
         from kornia.geometry.calibration import distort_points
         from kornia.geometry.camera.distortion_kannala_brandt import distort_points_kannala_brandt
 
         if self.fisheye:
             return distort_points_kannala_brandt(rays, rays.new_tensor([self.fx, self.fy, self.cx, self.cy, *(self.distortion or (0.0,) * 4)]))
-        focal, centre = rays.new_tensor([self.fx, self.fy]), rays.new_tensor([self.cx, self.cy])
-        pixels = rays * focal + centre
-        return distort_points(pixels, self.K.to(rays), rays.new_tensor(self.distortion)) if self.distortion else pixels
+        if self.distortion:
+            rays = distort_points(rays, torch.eye(3).to(rays), rays.new_tensor(self.distortion))
+        return rays * rays.new_tensor([self.fx, self.fy]) + rays.new_tensor([self.cx, self.cy])
 
     def undistorted(self) -> Lens:
         """The pinhole lens of the same size and principal point, zoomed in just so far that it sees nothing outside the photo.
